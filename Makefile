@@ -8,7 +8,7 @@
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style, types and names
-#   make site      build the pages of docs/ as a site, with every link checked (build/site)
+#   make site      build the pages of docs/ as a site, with every link checked, and print the field card (build/site)
 #   make px4-events  write flock_follower/mavlink/px4_events.txt from the sources of PX4, after `make px4_sitl` there: PX4='1.16=FOLDER 1.18=FOLDER'
 #   make bless     make the present result of the sample bag the golden one (test/frozen)
 #   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen
@@ -40,6 +40,8 @@
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   OUTPUT=folder       where `make demo` and `make fly` write (default: build/demo, build/fly)
 #   RUNS=20             how often `make flights` flies each scenario
+#   VIEW=no             `make demo` and `make fly` start no live page (default: http://127.0.0.1:8090)
+#   DETECTOR=FILE       a program whose poses `make fly` flies on: examples/other_detector.py
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it sends the truth,
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
@@ -50,6 +52,9 @@ $(if $(filter jazzy kilted,$(ROS)),,$(error ROS = $(ROS): must be jazzy or kilte
 VISION ?= 5
 $(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
 VENV := .venv$(patsubst %,-%,$(filter-out jazzy,$(ROS)))$(patsubst %,-opencv-%,$(filter-out 5,$(VISION)))
+VIEW ?= yes
+$(if $(filter yes no,$(VIEW)),,$(error VIEW = $(VIEW): must be yes or no))
+export VIEW
 TESTS ?= test
 MARKERS ?=
 SCENARIO ?= indoor
@@ -58,6 +63,7 @@ OUTPUT ?=
 TRUTH ?=
 FORWARD ?=
 LEADER ?=
+DETECTOR ?=
 DURATION ?= 0
 # Frozen flights are 25 runs of each scenario, unless RUNS is given.
 FROZEN_RUNS := $(if $(RUNS),--runs $(RUNS))
@@ -87,6 +93,7 @@ demo: setup
 fly: setup
 	@$(RUN) -m flock_desk.fly --scenario $(SCENARIO) --duration $(DURATION) \
 		--output $(or $(OUTPUT),build/fly) \
+		$(if $(DETECTOR),--detector $(DETECTOR)) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 

@@ -24,7 +24,8 @@ setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=['flock_*']),
-    package_data={'flock_desk': ['data/*'], 'flock_follower.mavlink': ['*.txt']},
+    package_data={'flock_desk': ['data/*'], 'flock_follower.mavlink': ['*.txt'],
+                  'flock_follower.view': ['static/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
         ('share/' + package_name, ['package.xml']),
@@ -49,9 +50,11 @@ setup(
                     'cluster': ['distributed'],
                     # Where there is no ROS; on a robot apt and rosdep bring all of it.
                     'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',
-                                'ros-jazzy-common-interfaces==5.3.6', 'matplotlib', 'numpy>=1.26',
-                                'opencv-python-headless>=4.7', 'pymavlink', 'pyyaml', 'rosbags',
-                                'mcap', 'scipy', 'tqdm'],
+                                'ros-jazzy-common-interfaces==5.3.6', 'aiohttp', 'matplotlib',
+                                'numpy>=1.26', 'opencv-python-headless>=4.7', 'pymavlink',
+                                'pyyaml', 'rosbags', 'mcap', 'scipy', 'tqdm'],
+                    # For examples/other_detector.py.
+                    'detector': ['pupil-apriltags'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [
@@ -64,6 +67,7 @@ setup(
             'black_box = flock_follower.nodes.black_box:main',
             'simulator = flock_desk.simulator_node:main',
             'visualizer = flock_follower.nodes.visualizer:main',
+            'view = flock_follower.nodes.view:main',
             'demo = flock_desk.demo:main',
             'fly = flock_desk.fly:main',
             'evaluate = flock_desk.evaluate:main',

@@ -34,7 +34,7 @@ import numpy as np
 
 from flock_desk.runs.console import guarded, logs_in
 from flock_desk.runs.figure_table import bounds
-from flock_desk.runs.flight import COUNTER_PERIOD, RECORDED, start
+from flock_desk.runs.flight import COUNTER_PERIOD, RECORDED, start, start_view, VIEW
 from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
@@ -130,6 +130,7 @@ def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | No
             '--param-file', str(resource('config/px4.params')),
             '--log', str(out / 'autopilot.npz')])
         start(processes, parameters, [*RECORDED, STATE])
+        start_view(processes)
         processes.wait_for_log('recorder', 'recording')
         processes.ask('mavlink_bridge/offboard')
         processes.ask('planner/engage')
@@ -141,7 +142,9 @@ def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | No
         if replay.returncode != 0:
             raise RuntimeError('the replay failed')
         time.sleep(COUNTER_PERIOD)
-        return processes.stop_all(), processes.load.worst(began)
+        exit_codes = processes.stop_all()
+        exit_codes.pop(VIEW, None)  # the page is no part of the flight
+        return exit_codes, processes.load.worst(began)
 
 
 def first_odometry(path: Path) -> OdometryState:

@@ -55,6 +55,18 @@ MODELS: dict[Model, str] = {
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
+MEANINGS = """
+min r2, max r2  least and greatest squared distance between two agents, and its time (of edges, if
+                the flock has a neighbor graph)
+mean distance   of all pairs at the end
+speed, heading  at the end: mean speed of the agents; direction of their mean velocity
+to 1 %          time from which on L stays below 1 % of its first value. L is the disagreement:
+                the root of the sum of |v_i - mean of v|^2
+order           at the end: length of the mean of the unit velocities; 1: one direction
+W               L plus a potential of the distances; decreases under the law if there is no leader;
+                inf: a pair is outside the band
+band            kept: sqrt(d0) < distance < sqrt(d1) at all times, for every pair or edge
+"""
 Row = tuple[str, ...]
 SAMPLE_PERIOD = 0.005  # s, of the paper's simulations
 FLOCK_DURATION = 20.0  # s, of the larger flock
@@ -103,7 +115,7 @@ def redraw(out: Path) -> list[str]:
     alone, followed = runs.values()
     continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
     three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1 (leader)', 'agent 2')
-    unseen = '(d), (e): an agent sees 1 m far; the leader is never so near'
+    unseen = '(d), (e): an agent detects others within 1 m;\nthe leader is always farther away'
     figures = {
         'leaderless_trajectories': plots.trajectories(alone, three, 10.0),
         'leaderless_speeds': plots.speeds(alone, three, 10.0),
@@ -115,7 +127,7 @@ def redraw(out: Path) -> list[str]:
     rows = [row(scenario, name, run)
             for scenario, by_name in runs.items() for name, run in by_name.items()]
     write_csv(out / 'results.csv', COLUMNS, rows)
-    print(aligned([COLUMNS, *rows]))
+    print(aligned([COLUMNS, *rows]), MEANINGS, sep='\n')
     return [*(plots.save(figure, out / name) for name, figure in figures.items()), 'results.csv']
 
 
@@ -154,7 +166,8 @@ def one_flock(out: Path, agents: int, dim: int, seed: int) -> list[str]:
     values = (m.time, m.min_r2, m.max_r2, m.mean_distance, m.speed, m.disagreement, m.order)
     write_csv(out / f'{name}.csv', columns, zip(*([_text(v, 6) for v in column]
                                                   for column in values)))
-    print(aligned([COLUMNS, row(f'{agents} agents, {dim}-D', MODELS['flocking'], run)]))
+    print(aligned([COLUMNS, row(f'{agents} agents, {dim}-D', MODELS['flocking'], run)]), MEANINGS,
+          sep='\n')
     return [plots.save(plots.flock(run), out / name), f'{name}.csv']
 
 

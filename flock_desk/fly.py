@@ -88,6 +88,9 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--followers', type=within(FOLLOWERS), default=1, metavar='N',
                         help='in a column, each behind the one before it (%(default)s); every one '
                         'takes about one core')
+    parser.add_argument('--detector', type=Path, metavar='FILE',
+                        help='a program that publishes poses of the leader, AprilTag 0 of 36h11; '
+                        "FILE with .yaml is its neighbors' file (examples/other_detector.py)")
     parser.add_argument('--output', type=Path, default='build/fly',
                         help='folder for report and logs (%(default)s)')
     parser.add_argument('--moving', type=Path, metavar='FILE',
@@ -110,6 +113,10 @@ def main(args: Sequence[str] | None = None) -> int:
         parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
     if options.autopilot and options.followers > 1:
         parser.error('--followers: not with --autopilot')
+    for file in [] if options.detector is None else [
+            options.detector, options.detector.with_suffix('.yaml')]:
+        if not file.is_file() or options.detector.suffix != '.py':
+            parser.error(f'--detector {options.detector}: {file} must be a file, and end with .py')
     if options.moving and options.followers > 1:
         parser.error('--moving: not with --followers')
     return guarded(partial(_fly, options), hint=partial(logs_in, options.output))
@@ -127,7 +134,7 @@ def _fly(options: argparse.Namespace) -> int:
         for namespace in ('', *namespaces(options.followers)):
             clear(options.output / namespace)
         flown = fly(scenario, options.scenario, options.seed, duration, options.output, external,
-                    options.followers)
+                    options.followers, options.detector)
         with explained(None if failed(flown.exit_codes) else flown.load):
             code = conclude(scenario, options.output, options.followers, flown)
             if flown.late and code != 1:

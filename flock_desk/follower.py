@@ -41,8 +41,8 @@ from flock_follower.flock.exchange import Sharing
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
 from flock_follower.gate.vehicle_status import VehicleStatus
-from flock_follower.gate.velocity_check import AUTOPILOT, ODOM
-from flock_follower.geometry import Array, yaw_from_quaternion
+from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport, ODOM
+from flock_follower.geometry import Array
 from flock_follower.messages import (
     ACCELERATION,
     from_acceleration,
@@ -60,6 +60,7 @@ from flock_follower.messages import (
 )
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
+from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
 from flock_follower.planner.inputs import OwnState
@@ -67,6 +68,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
+from flock_follower.pose_messages import POSE, PoseState
 
 
 @dataclass
@@ -208,7 +210,7 @@ class Follower:
     def estimate(self, time: int, velocity: Array) -> None:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
-        self._control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
+        self._control.take_motion(AUTOPILOT, MotionReport(velocity), 0.0, self._seconds())
 
     def attitude(self, time: int, quaternion: Array, rates: Array) -> OdometryState | None:
         """
@@ -217,7 +219,7 @@ class Follower:
         :returns: the motion without odometry, while that is flown on.
         """
         self.advance(time)
-        motion = self._control.update_attitude(
+        motion = self._control.take_attitude(
             quaternion, rates, self._seconds(), self._seconds())
         if motion is None or self._bridge_ended is not None:
             return None
@@ -229,7 +231,7 @@ class Follower:
     def height(self, time: int, altitude: float, height: float) -> None:
         """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
         self.advance(time)
-        self._control.update_height(altitude, self._seconds())
+        self._control.take_height(altitude, self._seconds())
         if not self._control.heights.referenced:
             self._control.heights.refer(height, self._seconds())
 
@@ -288,6 +290,22 @@ class Follower:
             if (rejection := self.perceiver.take_range(measured)) is not None:
                 self._listener.rejected(*rejection)
             self._use_ranges(self.perceiver)
+
+    def pose(self, time: int, name: str, state: PoseState) -> None:
+        """Take a neighbor's pose by another detector."""
+        self.advance(time)
+        if self.perceiver is not None:
+            rejection = self.perceiver.take_pose(name, state, self._seconds())
+            if rejection is not None:
+                self._listener.rejected(*rejection)
+            self._use_sources(self.perceiver)
+
+    def source_frame(self, time: int, stamp: int) -> None:
+        """Take the stamp, ns, of an image that another detector processes."""
+        self.advance(time)
+        if self.perceiver is not None:
+            self.perceiver.take_frame(stamp, self._seconds())
+            self._use_sources(self.perceiver)
 
     def neighbor(self, time: int, state: OdometryState) -> None:
         """Take a neighbor's state."""
@@ -377,11 +395,29 @@ class Follower:
                 self._listener.rejected(*rejection)
             for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
                 self._publish_neighbor(perceiver, image.stamp_ns, name, estimate)
+            if self._make is not None:
+                for topic, pose in perceiver.poses(self._make, seen):
+                    self._listener.publish(topic, POSE, self._now, pose)
             if seen.usable:
                 self._see_frame(image.stamp_ns)
             self._listener.image(ImageOutcome(
                 image.stamp_ns, sighting, seen.decoding, seen.perception, image.camera))
         self._use_ranges(perceiver)
+        self._use_sources(perceiver)
+
+    def _use_sources(self, perceiver: Perceiver) -> None:
+        for outcome in perceiver.sources.due(self._seconds()):
+            if isinstance(outcome, int):
+                self._see_frame(outcome)
+            elif isinstance(outcome, Sourced):
+                sighting = outcome.sighting
+                for rejection in sighting.rejections:
+                    self._listener.rejected(*rejection)
+                for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
+                    self._publish_neighbor(perceiver, outcome.stamp, name, estimate)
+                self._listener.image(ImageOutcome(outcome.stamp, sighting))
+            else:
+                self._listener.rejected(*outcome)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
         for outcome in perceiver.tracker.ranging.due():
@@ -442,9 +478,8 @@ class Follower:
         if state is not None:  # the newest since the last cycle: no other counts
             received = self._seconds(self._gate_received)
             age = stamp_age(state.stamp, self._gate_received)
-            if refused := control.update_velocity(
-                    self._source, state.velocity, age, received,
-                    yaw=yaw_from_quaternion(state.quaternion), position=state.position):
+            if refused := control.take_motion(
+                    self._source, MotionReport.from_odometry(state), age, received):
                 self._listener.rejected(f'odom {refused}', '')
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start

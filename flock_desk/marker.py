@@ -19,7 +19,8 @@ Draws markers to scale, one to a page, each with the white border that detection
 and prints the neighbors file. With ``--panel`` all are on one page, for one leader that is seen
 from near and from far: the largest on top, the smaller ones below it. The panel's origin is the
 middle of the smallest: nearby, the camera sees little else, so it belongs at the height of the
-camera. Two runs write the same bytes.
+camera. Two runs write the same bytes. ``--output NAME.png --pixels N`` writes one marker as a
+texture for simulators.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ import pathlib
 import sys
 from typing import NamedTuple
 
+import cv2
 from matplotlib import style
 from matplotlib.backends.backend_pdf import Name, PdfPages
 from matplotlib.figure import Figure
@@ -39,10 +41,12 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 import numpy as np
+from numpy.typing import NDArray
 
 from flock_desk.runs.console import guarded
 from flock_follower.neighbors_file import SIDE_LENGTHS
-from flock_follower.perception.markers import draw_marker, marker_cells
+from flock_follower.perception.markers import dictionary_size, draw_marker, marker_cells
+from flock_follower.ranges import Range
 from flock_follower.whole_file import whole_file
 
 #: Width and height, mm.
@@ -58,6 +62,7 @@ SIZES = (0.3, 0.06)
 MIN_QUIET = 0.16
 MARGIN = 5.0  # mm, along a page's edge where printers do not print
 LINE_WIDTH_MM = 0.2  # mm
+MOST_PIXELS = 8192  # of a texture's side
 CAPTION = (100.0, 30.0)  # mm, with the ruler, whose length is the caption's width
 INCH = 25.4  # mm
 
@@ -108,7 +113,9 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--size', type=float, nargs='+', default=[], metavar='M',
                         help='side of the black square, m (0.16); of a panel one for each id')
     parser.add_argument('--output', type=pathlib.Path, default='marker.pdf', metavar='FILE',
-                        help='.pdf; %(default)s')
+                        help='.pdf, or .png: one marker as a texture for simulators; %(default)s')
+    parser.add_argument('--pixels', type=int, metavar='N',
+                        help='side of the .png, white border of one cell included (100 a cell)')
     return guarded(partial(_write, parser.parse_args(args)), refused=2)
 
 
@@ -121,10 +128,15 @@ def _write(options: argparse.Namespace) -> int:
         raise ValueError(f'--id = {ids}: must name each marker once')
     if len(sizes) != (len(ids) if options.panel else 1):
         raise ValueError(f'--size = {sizes}: must be one side, of a panel one for each of {ids}')
-    if options.output.suffix.lower() != '.pdf':
-        raise ValueError(f'--output = {options.output}: must end in .pdf')
+    suffix = options.output.suffix.lower()
+    if suffix not in ('.pdf', '.png'):
+        raise ValueError(f'--output = {options.output}: must end in .pdf or .png')
     for size in sizes:
         SIDE_LENGTHS.check('--size', size)
+    if suffix == '.png':
+        return _write_texture(options, ids, sizes)
+    if options.pixels is not None:
+        raise ValueError(f'--pixels = {options.pixels}: only with --output NAME.png')
     groups = [ids] if options.panel else [[marker_id] for marker_id in ids]
     prints = [layout(options.dictionary, group, sizes) for group in groups]
     pages = [draw(options.dictionary, markers) for markers in prints]
@@ -137,6 +149,45 @@ def _write(options: argparse.Namespace) -> int:
         print(APRILTAG_NOTE, file=sys.stderr)
     print(neighbors_file(options.dictionary, prints))
     return 0
+
+
+def _write_texture(options: argparse.Namespace, ids: Sequence[int],
+                   sizes: Sequence[float]) -> int:
+    """Write one marker as an image and print its neighbors file."""
+    if len(ids) > 1:
+        raise ValueError(f'--id = {list(ids)}: a .png has one marker: write a file for each')
+    image = texture(options.dictionary, ids[0], options.pixels)
+    written, data = cv2.imencode('.png', image)
+    if not written:
+        raise OSError(f'{options.output}: not written')
+    with whole_file(options.output) as file:
+        file.write(data.tobytes())
+    cells = marker_cells(options.dictionary)
+    print(f'{options.output}: {len(image)} x {len(image)} pixels, upright; put it on a square of '
+          f'{sizes[0] * (cells + 2) / cells:.4f} m', file=sys.stderr)
+    if 'APRILTAG' in options.dictionary:
+        print(APRILTAG_NOTE, file=sys.stderr)
+    print(neighbors_file(options.dictionary, [layout(options.dictionary, ids, sizes)]))
+    return 0
+
+
+def texture(dictionary: str, marker_id: int, pixels: int | None = None) -> NDArray[np.uint8]:
+    """
+    Return a marker with a white border of one cell, (n, n), its first row on top.
+
+    :raises ValueError: for a number of pixels that is no multiple of the cells, or no such marker.
+    """
+    cells = marker_cells(dictionary)
+    whole = cells + 2
+    pixels = 100 * whole if pixels is None else pixels
+    if not 0 < pixels <= MOST_PIXELS or pixels % whole:
+        near = min(max(round(pixels / whole), 1), MOST_PIXELS // whole) * whole
+        raise ValueError(f'--pixels = {pixels}: must be a multiple of the {whole} cells, at most '
+                         f'{MOST_PIXELS}: {near}')
+    ids = Range(0, dictionary_size(dictionary) - 1, whole=True)
+    ids.check('--id', marker_id)
+    code = np.pad(draw_marker(dictionary, marker_id, cells), 1, constant_values=255)
+    return np.kron(code, np.ones((pixels // whole, pixels // whole), np.uint8))
 
 
 def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> list[Placed]:

@@ -32,7 +32,7 @@ from flock_follower.parameters.spec import Spec
 PROGRAMS: Final = {
     **{name: f'flock_follower.nodes.{name}' for name in (
         'relative_pose', 'planner', 'mavlink_bridge', 'flock', 'sharing', 'replay', 'black_box',
-        'visualizer', 'call')},
+        'visualizer', 'view', 'call')},
     'simulator': 'flock_desk.simulator_node', 'recorder': 'flock_desk.recorder_node',
     'check': 'flock_follower.check', 'follow': 'flock_follower.follow',
     **{name: f'flock_desk.{name}' for name in (
@@ -40,7 +40,7 @@ PROGRAMS: Final = {
 }
 #: The nodes on the page of parameters.
 NODES: Final = ('relative_pose', 'planner', 'mavlink_bridge', 'flock', 'replay', 'simulator',
-                'black_box', 'visualizer')
+                'black_box', 'visualizer', 'view')
 INTRODUCTION: Final = """\
 # Parameters
 

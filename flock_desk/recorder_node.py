@@ -34,7 +34,7 @@ from flock_follower.bags.mcap_file import incomplete
 from flock_follower.bags.writer import BagWriter
 from flock_follower.nodes import no_exit_deadline
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.runtime import run, spin
+from flock_follower.nodes.support.process import run, spin
 
 
 class Recorder(Node):

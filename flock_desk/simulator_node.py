@@ -67,7 +67,8 @@ from flock_follower.checks.processor import children, LoadMeter
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 
@@ -83,6 +84,8 @@ PICTURE_PERIOD = 10.0  # s between images that are logged
 SPECS = [
     Spec('scenario', 'indoor',
          'a name in config/scenarios, or the path of a .yaml file'),
+    Spec('dictionary', 'DICT_4X4_50',
+         "dictionary of the leader's marker, whose id is 0: as that of neighbors_file"),
     Spec('seed', 0, 'seed of all random numbers', SEED_RANGE),
     Spec('duration', 0.0, 'flight time; 0: the duration of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
@@ -139,7 +142,7 @@ class Simulator(FlockNode):
         self.subscribe(String, 'planner/state', self._take_state, LATCHED_QOS, required=False)
         seed = self._values['seed']
         # It takes a second or two: the clock starts after it.
-        camera = real_time_camera(seed, scenario.prints)
+        camera = real_time_camera(seed, scenario.prints, self._values['dictionary'])
         self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
                                          self.diagnostics.rate('image_raw'))
         self._vehicle: EmbeddedVehicle | ExternalVehicle

@@ -13,9 +13,10 @@
 # limitations under the License.
 
 """
-``mavlink_bridge/state`` reports whether the vehicle flies the planner's commands.
+What the bridge reports to other nodes and programs, and how they read it.
 
-Its text is a state and, after a colon, the reason::
+``mavlink_bridge/state`` reports whether the vehicle flies the planner's commands. Its text is a
+state and, after a colon, the reason::
 
     NO_AUTOPILOT: none received yet
     INACTIVE: offboard was not requested
@@ -24,21 +25,40 @@ Its text is a state and, after a colon, the reason::
     TAKEN_OVER: offboard was left for POSCTL
 
 The bridge sends it at each change, and at 2 Hz: otherwise ``ACTIVE`` of a dead bridge would stay
-on the latched topic. Nothing here reads a clock.
+on the latched topic. Its diagnostics are texts by the keys below. Both are read here alone: what
+decides by them takes ``parse`` and ``read_flag``. Nothing here reads a clock.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import math
-import re
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = BRIDGE_STATES = (
     'NO_AUTOPILOT', 'INACTIVE', 'READY', 'ACTIVE', 'TAKEN_OVER')
 TOPIC = 'mavlink_bridge/state'
 #: Where the vehicle was armed, in the frame of the odometry; latched.
 ARMED_AT_TOPIC = 'mavlink_bridge/armed_at'
-SILENCE = 1.0  # s: two of the bridge's repetitions may get lost
+# Keys of the diagnostics of the bridge, which writes them; ``check`` and ``follow`` read them.
+PARAMETER: Final = 'parameter '
+MISSING: Final = 'missing parameter '
+UNPROVEN: Final = 'unproven firmware'
+NOT_READY: Final = 'not ready to arm'
+UNREAD: Final = 'parameters unread'
+#: That the autopilot answers nothing, or ''; the questions that have no answer.
+NO_ANSWERS: Final = 'no answers'
+UNANSWERED: Final = 'unanswered questions'
+REFUSED: Final = 'offboard would be refused'
+LINK_FAULT: Final = 'link fault'
+
+ARMED: Final = 'armed'
+#: Whether the autopilot reports that the vehicle is in the air.
+FLYING: Final = 'flying'
+
+SILENCE_MAX = 1.0  # s: two of the bridge's repetitions may get lost
+#: Begins the reason after an autopilot was received; the state before follows.
+LOST: Final = 'lost, '
 _LONGEST_REASON = 200  # characters
 
 
@@ -48,14 +68,25 @@ class BridgeState(NamedTuple):
     name: str
     reason: str = ''
 
+    @property
+    def last_known(self) -> BridgeState:
+        """Return the state before the autopilot was lost, if it is lost; else this one."""
+        lost = self.name == NO_AUTOPILOT and self.reason.startswith(LOST)
+        return parse(self.reason.removeprefix(LOST)) if lost else self
+
     def __str__(self) -> str:
         return f'{self.name}: {self.reason}' if self.reason else self.name
 
 
+def read_flag(values: Mapping[str, str], key: str) -> bool | None:
+    """Return a value of diagnostics that is true or false, None if it is unknown."""
+    return {'True': True, 'False': False}.get(values.get(key, ''))
+
+
 def parse(text: str) -> BridgeState:
     """Return the state in a message; an unknown state, or none, counts as ``INACTIVE``."""
-    name, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
-        r'\s*([^:\s]*)[:\s]*(.*)', text, re.DOTALL).groups()
+    name = ''.join(text.split()[:1]).partition(':')[0]
+    reason = text.lstrip()[len(name):].lstrip(': \t\r\n')
     if name not in BRIDGE_STATES:
         return BridgeState(INACTIVE, f'unknown state of the bridge: {text[:40]!r}')
     return BridgeState(name, ' '.join(reason.split())[:_LONGEST_REASON])
@@ -71,6 +102,6 @@ def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     if reported is None or math.isinf(age):
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (if another program flies '
                            'the commands, set require_bridge:=false)')
-    if not age <= SILENCE:  # written so that NaN fails
+    if not age <= SILENCE_MAX:  # written so that NaN fails
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
     return reported

@@ -37,8 +37,10 @@ from flock_follower.messages import (
     twist,
 )
 
-#: The names of further joints of a command, see :func:`trajectory`; both are on the wire.
-SEPARATION_JOINT, ALTITUDE_JOINT = 'separation', 'altitude'
+#: The names of further joints of a command, see :func:`trajectory`; all are on the wire.
+SEPARATION_JOINT, ALTITUDE_JOINT, RETREAT_JOINT = 'separation', 'altitude', 'retreat'
+#: Time without odometry, s, for which the gate keeps the velocity of the retreat.
+ODOMETRY_GAP = 3.0
 
 
 class Command(NamedTuple):
@@ -65,6 +67,9 @@ class Command(NamedTuple):
     """The altitude that it leads to, m, in the frame ``frame``; NaN if it leads to none."""
     relative: bool = False
     """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
+    retreat: Array | None = None
+    """Velocity (3,), m/s, to brake to if odometry is lost: away from a neighbor that comes. None
+    without such a neighbor."""
 
     def ages(self, now: int) -> tuple[float, float]:
         """Return the ages of the command and of its image, s, at a time, ns."""
@@ -77,8 +82,8 @@ def trajectory(make: Make, command: Command) -> Any:
     Return a command as a MultiDOFJointTrajectory of one point.
 
     Position and velocity are NaN: they are not commanded. The acceleration of a joint 'separation'
-    is ``separation_axis``, the height of a joint 'altitude' is ``altitude``. A receiver of only
-    the first joint ignores both.
+    is ``separation_axis``, the height of a joint 'altitude' is ``altitude``, the velocity of a
+    joint 'retreat' is ``retreat``. A receiver of only the first joint ignores them.
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
@@ -88,6 +93,8 @@ def trajectory(make: Make, command: Command) -> Any:
         joints[SEPARATION_JOINT] = command.separation_axis
     if math.isfinite(command.altitude):
         joints[ALTITUDE_JOINT] = np.zeros(3)
+    if command.retreat is not None:
+        joints[RETREAT_JOINT] = np.zeros(3)
     message.joint_names = list(joints)
     velocity = twist(make, [math.nan] * 3)
     velocity.angular.z = float(command.yaw_rate)
@@ -99,6 +106,8 @@ def trajectory(make: Make, command: Command) -> Any:
         set_quaternion(transform.rotation, quaternion_from_yaw(command.yaw))
         point.transforms.append(transform)
     point.velocities = [velocity] * len(joints)
+    if command.retreat is not None:
+        point.velocities[-1] = twist(make, command.retreat)
     point.accelerations = [twist(make, vector) for vector in joints.values()]
     set_stamp(point.time_from_start, command.ahead)
     message.points = [point]
@@ -125,11 +134,14 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     separation_axis = _direction(more.get(SEPARATION_JOINT, np.zeros(3)))
     heights = [float(beside.translation.z) for name, beside in zip(
         message.joint_names[1:], point.transforms[1:]) if name == ALTITUDE_JOINT]
+    retreats = [to_array(beside.linear) for name, beside in zip(
+        message.joint_names[1:], point.velocities[1:]) if name == RETREAT_JOINT]
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
         point.velocities[0].angular.z if point.velocities else 0.0, separation_axis, frame,
         read_stamp(message.header.stamp), read_stamp(point.time_from_start),
-        heights[0] if heights else math.nan, frame == RELATIVE)
+        heights[0] if heights else math.nan, frame == RELATIVE,
+        retreats[0] if retreats else None)
 
 
 def _direction(vector: Array) -> Array | None:

@@ -31,6 +31,7 @@ from collections.abc import Sequence
 import re
 import sys
 
+from flock_follower.bridge_state import FLYING, read_flag
 from flock_follower.check import SECONDS, table
 from flock_follower.checks.findings import ready
 from flock_follower.checks.recorded_system import judge_all
@@ -63,7 +64,7 @@ def main(args: Sequence[str] | None = None) -> int:
     print(table(seen, findings))
     flyable = ready(findings)
     bridge = seen.status('mavlink_bridge')
-    flying = bridge is not None and bridge.values.get('flying') == 'True'
+    flying = bridge is not None and read_flag(bridge.values, FLYING) is True
     if not flyable and (options.yes or not flying):
         return 1
     return fly(options.namespace, not options.yes, flyable)

@@ -32,6 +32,18 @@ A neighbor that carries several has, instead of the last four keys, a list of th
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
+A neighbor whose pose another detector measures has, instead of markers, its source::
+
+      - name: leader
+        pose_topic: /tracker/leader   # PoseStamped, PoseWithCovarianceStamped or Odometry
+        position_std: 0.05       # m, and
+        attitude_std: 0.1        # rad, per axis: of messages without a covariance
+        position_only: false     # true: its attitude is not used
+
+or ``tf_frame: leader`` instead of ``pose_topic``: its frame on ``/tf``; both deviations are then
+needed. ``frames_topic`` beside ``neighbors``, if none has markers: a topic with a header, of one
+message for each image that the other detector processes, with a neighbor in it or not.
+
 Each neighbor may have keys for the planner::
 
         role: follower           # leader (the default), follower, or avoid: kept clear of only
@@ -75,6 +87,11 @@ POSITIONS = Range(-5.0, 5.0, 'm')
 ANGLES = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
 #: Of a hull; the planner has the same.
 RADII = Range(0.0, 5.0, 'm')
+#: Deviations of the pose of another detector, per axis.
+POSITION_STDS = Range(0.001, 1.0, 'm')
+ATTITUDE_STDS = Range(0.001, 1.0, 'rad')
+_SOURCES = {'pose_topic', 'tf_frame'}
+_SOURCE_KEYS = {'position_std', 'attitude_std', 'position_only'}
 ROLES = ('leader', 'follower', 'avoid')
 _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
 
@@ -88,9 +105,22 @@ class Marker:
     T_body_marker: Transform
 
 
+@dataclass(frozen=True)
+class PoseSource:
+    """The topic, or the frame on ``/tf``, by which another detector sends a neighbor's pose."""
+
+    topic: str = ''
+    tf_frame: str = ''
+    position_std: float | None = None
+    """Per axis, m, if the message has no covariance; None: it must have one."""
+    attitude_std: float | None = None
+    """Likewise, rad."""
+    position_only: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class MarkedNeighbor:
-    """One neighbor, and the markers mounted rigidly on it, at least one."""
+    """One neighbor, and the markers mounted rigidly on it; none if it has a ``source``."""
 
     name: str
     markers: tuple[Marker, ...]
@@ -100,6 +130,8 @@ class MarkedNeighbor:
     """Radius of its hull, m."""
     tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Where the antenna is on its body (FLU), m, that ranges are measured to."""
+    source: PoseSource | None = None
+    """Of its poses, if it has no markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +139,10 @@ class NeighborConfig:
     """The neighbors to look for; names and marker ids are unique, all of one dictionary."""
 
     dictionary: str
+    """Of all markers; '' without any."""
     neighbors: tuple[MarkedNeighbor, ...]
+    frames_topic: str = ''
+    """Of one message for each image that another detector processes."""
 
     def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
         """Return the neighbors with their markers, by marker id."""
@@ -153,11 +188,18 @@ def parse(document: Any,
     :param dictionary_size: see :func:`load`.
     :raises ValueError: naming the key, its value and the valid range.
     """
-    _check_keys('the document', document, {'dictionary', 'neighbors'})
-    dictionary = str(document['dictionary'])
-    ids = Range(0, dictionary_size(dictionary) - 1, whole=True)
+    marked = not isinstance(document, Mapping) or 'dictionary' in document or not any(
+        isinstance(each, Mapping) and _SOURCES & {*each} for each in document.get('neighbors', ()))
+    _check_keys('the document', document, {'neighbors'} | ({'dictionary'} if marked else set()),
+                {'frames_topic'})
+    dictionary = str(document['dictionary']) if marked else ''
+    ids = Range(0, dictionary_size(dictionary) - 1, whole=True) if marked else None
     neighbors = tuple(_parse_neighbor(where, entry, ids)
                       for where, entry in _entries('neighbors', document['neighbors']))
+    frames_topic = _name('frames_topic', document.get('frames_topic', ''))
+    if frames_topic and any(neighbor.markers for neighbor in neighbors):
+        raise ValueError(f'frames_topic = {frames_topic!r}: remove it: with markers, the images '
+                         'show which frames are processed')
     taken: set[object] = set()
     for i, neighbor in enumerate(neighbors):
         for key, value in (('name', neighbor.name),
@@ -165,13 +207,15 @@ def parse(document: Any,
             if value in taken:
                 raise ValueError(f'neighbors[{i}].{key} = {value!r}: must be unique')
             taken.add(value)
-    return NeighborConfig(dictionary, neighbors)
+    return NeighborConfig(dictionary, neighbors, frames_topic)
 
 
-def _parse_neighbor(where: str, entry: Any, ids: Range) -> MarkedNeighbor:
+def _parse_neighbor(where: str, entry: Any, ids: Range | None) -> MarkedNeighbor:
     several = isinstance(entry, Mapping) and 'markers' in entry
-    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
-                {'role', 'radius', 'tag_position'})
+    source = next(iter(_SOURCES & {*entry}), '') if isinstance(entry, Mapping) else ''
+    _check_keys(where, entry, {'name', source} if source else {'name', 'markers'} if several else {
+        'name', *_MARKER_KEYS}, {'role', 'radius', 'tag_position'} | (
+            _SOURCE_KEYS if source else set()))
     name, role, radius = entry['name'], entry.get('role', 'leader'), entry.get('radius', 0.0)
     if not isinstance(name, str) or name.split() != [name]:
         raise ValueError(f'{where}.name = {name!r}: must be a word')
@@ -179,6 +223,11 @@ def _parse_neighbor(where: str, entry: Any, ids: Range) -> MarkedNeighbor:
         raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
     RADII.check(f'{where}.radius', radius)
     x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0] * 3), POSITIONS)
+    if source:
+        return MarkedNeighbor(name, (), role, float(radius), (x, y, z),
+                              _parse_source(where, source, entry))
+    if ids is None:
+        raise ValueError('the document lacks dictionary')
     if several:
         places = _entries(f'{where}.markers', entry['markers'])
         for place, marker in places:
@@ -187,6 +236,31 @@ def _parse_neighbor(where: str, entry: Any, ids: Range) -> MarkedNeighbor:
         places = [(where, entry)]
     markers = tuple(_parse_marker(place, marker, ids) for place, marker in places)
     return MarkedNeighbor(name, markers, role, float(radius), (x, y, z))
+
+
+def _parse_source(where: str, key: str, entry: Mapping[str, Any]) -> PoseSource:
+    only = entry.get('position_only', False)
+    if not isinstance(only, bool):
+        raise ValueError(f'{where}.position_only = {only!r}: must be true or false')
+    deviations: dict[str, float] = {}
+    for name, valid in (('position_std', POSITION_STDS), ('attitude_std', ATTITUDE_STDS)):
+        if name in entry:
+            valid.check(f'{where}.{name}', entry[name])
+            deviations[name] = float(entry[name])
+        elif key == 'tf_frame' and not (only and name == 'attitude_std'):
+            raise ValueError(f'{where} lacks {name}: transforms have no covariance')
+    topic = _name(f'{where}.{key}', entry[key])
+    if not topic:
+        raise ValueError(f"{where}.{key} = '': must be a word")
+    place = ('', topic) if key == 'tf_frame' else (topic, '')
+    return PoseSource(*place, deviations.get('position_std'), deviations.get('attitude_std'), only)
+
+
+def _name(where: str, value: Any) -> str:
+    """Return the name of a topic or frame."""
+    if not isinstance(value, str) or (value and value.split() != [value]):
+        raise ValueError(f'{where} = {value!r}: must be a word')
+    return value
 
 
 def _parse_marker(where: str, entry: Any, ids: Range) -> Marker:

@@ -53,6 +53,7 @@ def start(context: LaunchContext) -> list[Any]:
         'namespace': f'follower_{i}', 'system': str(i), 'scenario': values['scenario'],
         'seed': str(int(values['seed']) + i - 1), 'port': str(int(values['port']) + i - 1),
         'leader_topic': f'/follower_{i - 1}/truth/motion' if i > 1 else '',
+        **({'view': 'false'} if i > 1 else {}),  # one page, that of the first
     }.items()) for i in range(1, int(values['followers']) + 1)]
 
 

@@ -55,6 +55,7 @@ ARGUMENTS = {
     'respawn': ('true', 'start a node again that ended, after a second; a bridge sends nothing '
                 'until mavlink_bridge/offboard is called'),
     'visualize': ('false', 'true: visualizer, too, which draws the flight for RViz and Foxglove'),
+    'view': ('false', 'true: view, too, a live page at http://127.0.0.1:8090'),
     'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
     'bridge_prefix': ('', 'command that starts mavlink_bridge, alone, such as '
                       '/usr/local/lib/flock_follower/prefer_realtime 3 40'),
@@ -70,12 +71,13 @@ PARAMETERS = {
     'planner': ['a_max', 'v_max', 'camera_rpy', *ODOMETRY],
     'mavlink_bridge': ['connection', 'target_system', 'a_max', 'v_max', *ODOMETRY],
     'visualizer': [],
+    'view': [],
     'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
 NUMBERS = ('a_max', 'v_max')
 WHOLE = ('target_system', 'disk_used')
 #: By which argument a node is started or not.
-BY_CHOICE = {'visualizer': 'visualize', 'black_box': 'record'}
+BY_CHOICE = {'visualizer': 'visualize', 'view': 'view', 'black_box': 'record'}
 
 
 def value(name: str, text: str) -> Any:
@@ -115,7 +117,8 @@ def start(context: LaunchContext) -> list[Node]:
         started.append(Node(
             package='flock_follower', executable=node, exec_name=node, output='screen',
             prefix=f'{END_WITH_LAUNCH} {prefix}',
-            respawn=yes(values, 'respawn'), respawn_delay=1.0,
+            # A page whose port is busy would be refused for ever.
+            respawn=yes(values, 'respawn') and node != 'view', respawn_delay=1.0,
             namespace=values['namespace'], parameters=[*files, parameters],
             remappings=[('image_raw', values['image']),
                         ('image_raw/compressed', f'{values["image"]}/compressed'),

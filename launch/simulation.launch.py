@@ -19,6 +19,7 @@ The exit code is 1 if the simulator ends with an error, or because the machine i
 its last line begins with ``too busy:``.
 """
 
+import os
 from pathlib import Path
 import runpy
 import sys
@@ -48,6 +49,8 @@ ARGUMENTS = {
     'port': ('14540', 'UDP port, on this machine only, between autopilot and bridge'),
     'system': ('1', 'MAVLink system id of the autopilot'),
     'visualize': ('true', 'visualizer, too, which draws the flight for RViz and Foxglove'),
+    'view': ('false' if os.environ.get('VIEW') == 'no' else 'true',
+             'view, too, a live page at http://127.0.0.1:8090; false, or VIEW=no: none'),
     'record': ('false', 'true: a black box records the flight'),
     'leader_topic': ('', "truth/motion of another follower's simulator: that is the leader"),
 }
@@ -79,6 +82,7 @@ def generate_launch_description() -> LaunchDescription:
                           'record': LaunchConfiguration('record'),
                           'target_system': LaunchConfiguration('system'),
                           'visualize': LaunchConfiguration('visualize'),
+                          'view': LaunchConfiguration('view'),
                           'connection': ['udpin:127.0.0.1:', port]}.items())
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]

@@ -24,6 +24,7 @@ import pytest
 from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.command_messages import Command
 from flock_follower.gate.gate import Gate
+from flock_follower.gate.velocity_check import MotionReport
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
@@ -93,8 +94,8 @@ class Flight(SteppedAutopilot):
             self.bridge.receive(now)
             velocity = self.vehicle.velocity + self.odom_error
             if self.odometry:
-                self.bridge.gate.update_velocity(
-                    'odom', velocity, 0.0, now, yaw=self.vehicle.yaw + self.odom_yaw)
+                self.bridge.gate.take_motion('odom', MotionReport(
+                    velocity, self.vehicle.yaw + self.odom_yaw), 0.0, now)
             if self.forwards and self.steps % 2 == 0:
                 self.bridge.forward(OdometryState(
                     0, 'odom', 'base_link', self.vehicle.position.copy(), self.vehicle.quaternion,

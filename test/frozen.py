@@ -49,6 +49,7 @@ from flock_desk.closed_loop.metrics import measure
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.command_messages import Command
 from flock_follower.gate.gate import Gate
+from flock_follower.gate.velocity_check import MotionReport
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.messages import OdometryState
@@ -122,7 +123,8 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
         transport.arrived.append(bytes(mavlink.MAVLink_extended_sys_state_message(
             0, mavlink.MAV_LANDED_STATE_IN_AIR).pack(codec)))
         bridge.receive(now)
-        bridge.gate.update_velocity('odom', velocity, 0.02, now, yaw=0.5, position=now * velocity)
+        bridge.gate.take_motion(
+            'odom', MotionReport(velocity, 0.5, now * velocity), 0.02, now)
         if k % 5 == 0:
             bridge.forward(OdometryState(
                 0, 'odom', 'base_link', now * velocity, np.array([0.0, 0.0, 0.6, 0.8]), velocity,

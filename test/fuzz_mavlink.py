@@ -42,6 +42,7 @@ from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase, TAKEOVER_TIME
 from flock_follower.gate.setpoint_rules import COMMAND
+from flock_follower.gate.velocity_check import MotionReport
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
@@ -231,7 +232,7 @@ class BridgeUnderFire:
             self._restarts, self._taken_over = restarts, -math.inf
         if phase is not Phase.TAKEN_OVER:
             self._free = True
-        elif not permission.cause.pilot:  # a failsafe bars nothing, a pilot after it does
+        elif not permission.taker.pilot:  # a failsafe bars nothing, a pilot after it does
             self._free, self._taken_over = True, -math.inf
         elif self._free:
             self._free, self._taken_over = False, self.now
@@ -249,8 +250,8 @@ class BridgeUnderFire:
             self.bridge.gate.take_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
         vehicle = self.traffic.autopilot.vehicle
         if r.random() < 0.5:
-            self.gate.update_velocity('odom', vehicle.velocity + 0.1 * np.array(vector),
-                                      r.choice((0.0, 0.1, -1.0)), now, yaw=vehicle.yaw)
+            report = MotionReport(vehicle.velocity + 0.1 * np.array(vector), vehicle.yaw)
+            self.gate.take_motion('odom', report, r.choice((0.0, 0.1, -1.0)), now)
         self.bridge.forward(OdometryState(
             0, 'odom', 'base_link', r.choice((1.0, 1.0, 1e6)) * _vector(r),
             np.array([0.0, 0.0, 0.0, 1.0]), _vector(r), _vector(r),

@@ -58,7 +58,7 @@ def result() -> list[Row]:
         with open_bag(BAG) as original, open_bag(path) as published:
             rows = [_row(m.topic, deserialize(m.data, m.msgtype), original.start_ns)
                     for m in published.messages() if m.topic not in (
-                        '/planner/state', '/neighbors/acceleration')]
+                        '/planner/state', '/neighbors/acceleration', '/neighbors/leader/pose')]
     return sorted(rows, key=lambda row: (row[0], row[1]))
 
 

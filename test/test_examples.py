@@ -100,3 +100,30 @@ def test_the_workflow_judges_a_bag(tmp_path: Path) -> None:
     verdicts = {line.split(maxsplit=2)[2]: line.split()[0] for line in judged.stdout.splitlines()}
     assert verdicts['share of images in which the leader was found: at least 0.95'] == 'ok'
     assert judged.returncode == ('BROKEN' in verdicts.values())
+
+
+def test_the_other_detector_finds_the_leader_and_is_short(ros: None) -> None:
+    page = EXAMPLES / 'other_detector.py'
+    text = page.read_text().partition('limitations under the License.\n\n')[2]
+    assert 0 < len(text.splitlines()) <= 60
+    pytest.importorskip('pupil_apriltags')
+    from sensor_msgs.msg import CameraInfo, Image
+
+    from flock_desk.camera.renderer import T_BODY_OPTICAL
+    from flock_desk.closed_loop.real_time_flight import calibration, real_time_camera
+    from flock_follower.geometry import quaternion_from_yaw, Transform
+    from flock_follower.pose_messages import from_pose
+    camera = real_time_camera(0, dictionary='DICT_APRILTAG_36h11')
+    leader = Transform.from_quaternion([2.0, 0.2, 1.0], quaternion_from_yaw(0.4))
+    own = Transform.from_quaternion([0.0, 0.0, 1.0], quaternion_from_yaw(0.0)) @ T_BODY_OPTICAL
+    pixels = camera.image(0, [own], [leader])
+    node, sent = runpy.run_path(str(page))['OtherDetector'](), []
+    node.poses.publish = sent.append
+    node.calibrate(CameraInfo(**calibration(camera.camera)))
+    node.detect(Image(height=pixels.shape[0], width=pixels.shape[1], step=pixels.shape[1],
+                      encoding='mono8', data=pixels.tobytes()))
+    node.destroy_node()
+    [found] = [from_pose(message) for message in sent]
+    true = own.inverse() @ leader
+    assert abs(found.position - true.translation).max() < 0.05
+    assert abs(found.quaternion @ true.quaternion) > 0.99

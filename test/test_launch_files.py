@@ -98,6 +98,9 @@ def test_nodes_are_started_by_choice_again_and_with_the_command_given() -> None:
         name: [*END_WITH_LAUNCH, *(['taskset', '-c', '3'] if name == 'mavlink_bridge' else [])]
         for name in nodes}
     assert ('odom', '/vio/odom') in nodes['visualizer'].remappings
+    nodes, _ = launched(FOLLOWER, view='true')
+    assert nodes.keys() == {*SPECS, 'view'}
+    assert not nodes['view'].respawn  # if its port is busy, it would be refused for ever
 
 
 def column(**arguments: str) -> list[dict[str, str]]:
@@ -112,7 +115,8 @@ def test_a_column_gives_out_namespaces_ids_and_ports() -> None:
     assert column(followers='3', seed='7') == [
         {'namespace': f'follower_{i}', 'system': str(i), 'scenario': 'indoor',
          'seed': str(6 + i), 'port': str(14539 + i),
-         'leader_topic': f'/follower_{i - 1}/truth/motion' if i > 1 else ''} for i in (1, 2, 3)]
+         'leader_topic': f'/follower_{i - 1}/truth/motion' if i > 1 else '',
+         **({'view': 'false'} if i > 1 else {})} for i in (1, 2, 3)]
     for followers in ('0', '9', 'two'):
         with pytest.raises(ValueError, match=r'must be an integer in \[1, 8\]'):
             column(followers=followers)
@@ -205,3 +209,16 @@ def test_a_number_is_given_as_a_number_and_a_name_as_a_string(
 def test_an_invalid_value_is_refused(file: str, argument: str, text: str, valid: str) -> None:
     with pytest.raises(ValueError, match=f'{argument}:={text}: must be {valid}'):
         launched(file, **{argument: text})
+
+
+def test_detector_launch_starts_perception_alone_without_odometry() -> None:
+    nodes, _ = launched('detector.launch.py', image='/cam/image', camera_info='/cam/info',
+                        namespace='lab')
+    assert nodes.keys() == {'relative_pose'}
+    node, known = nodes['relative_pose'], {spec.name: spec for spec in RELATIVE_POSE}
+    for name, value in node.parameters[-1].items():
+        known[name].check(value)
+    assert node.parameters[-1]['odometry'] == 'none' and node.namespace == 'lab'
+    assert dict(node.remappings)['image_raw/compressed'] == '/cam/image/compressed'
+    with pytest.raises(OSError):
+        launched('detector.launch.py', neighbors_file='/none.yaml')

@@ -47,6 +47,12 @@ def test_a_distribution_of_ros_that_has_no_lock_is_refused_with_those_that_have(
     assert 'ROS = lyrical: must be jazzy or kilted.  Stop.' in ended.stderr
 
 
+def test_the_live_page_is_on_or_off():
+    ended = make('fly', 'VIEW=maybe')
+    assert ended.returncode == 2 and 'VIEW = maybe: must be yes or no.  Stop.' in ended.stderr
+    assert make('fly', 'VIEW=no').returncode == 0
+
+
 @pytest.mark.parametrize(('settings', 'environment', 'locks'), [
     ([], '.venv', ('lock-jazzy', 'vision-5')),
     (['VISION=4.10'], '.venv-opencv-4.10', ('lock-jazzy', 'vision-4.10')),

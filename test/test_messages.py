@@ -139,6 +139,15 @@ def test_the_age_of_a_command_is_from_when_it_applies() -> None:
     assert stamp_age(0, SECOND) == 0.0
 
 
+@BOTH
+def test_the_velocity_of_a_retreat_survives_the_round_trip(new: Make) -> None:
+    command = Command((1.0, 0.0, 0.0), 0.5, retreat=np.array([-0.5, 0.25, 0.0]), altitude=2.0)
+    back = from_trajectory(trajectory(new, command), 'odom')
+    assert back.retreat is not None and back.retreat.tolist() == [-0.5, 0.25, 0.0]
+    assert back.altitude == 2.0 and back.separation_axis is None
+    assert from_trajectory(trajectory(new, command._replace(retreat=None)), 'odom').retreat is None
+
+
 def test_a_command_on_the_marker_alone_is_marked_by_its_frame():
     message = trajectory(empty, COMMAND._replace(relative=True))
     assert message.header.frame_id == RELATIVE

@@ -40,8 +40,8 @@ SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals', 'who
 ROOMS = {
     'messages': ('', 'numpy'),
     'command_messages': ('messages', 'numpy'),
+    'pose_messages': ('messages', 'numpy'),
     'flocking': ('', 'numpy'),
-    'bridge_keys': ('', ''),
     'bridge_state': ('', ''),
     'topic_names': ('messages', ''),
     # The markers by name and size alone: the planner reads the file, too.
@@ -52,33 +52,38 @@ ROOMS = {
     'flock': ('flocking messages', 'numpy'),
     'planner': ('bridge_state command_messages flock flocking messages neighbors_file odometry '
                 'parameters', 'numpy'),
-    'perception': ('messages neighbors_file odometry parameters', 'cv2 numpy'),
+    'perception': ('messages neighbors_file odometry parameters pose_messages', 'cv2 numpy'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'gate': ('bridge_state command_messages messages planner', 'numpy'),
     'mavlink': ('bridge_state gate messages odometry parameters', 'numpy pymavlink'),
     'bags': ('parameters', 'mcap numpy rosbags yaml'),
     'flight_parameters': ('mavlink parameters perception planner', ''),
-    'checks': ('bags bridge_keys messages neighbors_file odometry parameters perception '
-               'topic_names', 'cv2 numpy'),
+    'checks': ('bags bridge_state messages neighbors_file odometry parameters perception '
+               'pose_messages topic_names', 'cv2 numpy'),
     'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
-    'follow': ('check checks nodes', ''),
-    'support': ('bridge_keys bridge_state gate mavlink messages odometry parameters',
-                'ROS numpy'),
+    'follow': ('bridge_state check checks nodes', ''),
+    # The page of a flight, without ROS: what it shows, and its server.
+    'view': ('bridge_state command_messages messages odometry parameters perception planner',
+             'aiohttp cv2 numpy'),
+    'support': ('bridge_state gate mavlink messages odometry parameters perception '
+                'pose_messages', 'ROS numpy'),
     'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
-              'parameters perception planner support topic_names', 'ROS numpy yaml'),
+              'parameters perception planner pose_messages support topic_names view',
+              'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink'),
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'follower': ('command_messages flock gate messages perception planner', ''),
+    'follower': ('command_messages flock gate messages perception planner pose_messages', ''),
     'sensors': ('scenarios', 'numpy'),
     'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
                     'perception planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop command_messages flocking flocks follower gate '
-             'mavlink messages neighbors_file odometry parameters perception planner scenarios '
-             'topic_names', 'PIL cv2 distributed matplotlib numpy tqdm yaml'),
+             'mavlink messages neighbors_file odometry parameters perception planner '
+             'pose_messages scenarios topic_names',
+             'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags bridge_state camera checks closed_loop external flight_parameters '
                    'flocks mavlink messages neighbors_file nodes parameters perception '

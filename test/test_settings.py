@@ -47,7 +47,7 @@ def test_the_defaults_can_fly():
 
 
 def test_the_recommendation_for_first_flights_can_fly():
-    text = (ROOT / 'docs' / 'fly.md').read_text(encoding='utf-8')
+    text = (ROOT / 'docs' / 'field_card.md').read_text(encoding='utf-8')
     assert '`v_max` 0.3, `a_max` 1.5 for the first flights' in text
     assert found(v_max=0.3, a_max=1.5) == []
 

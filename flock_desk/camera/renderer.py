@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flock_desk.camera.lens import Camera
 from flock_follower.geometry import Array, R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
-from flock_follower.perception.markers import draw_marker
+from flock_follower.perception.markers import draw_marker, marker_cells
 
 Image = NDArray[np.float32]
 
@@ -331,10 +331,11 @@ def board(face: Face, thickness: float = 0.01) -> list[Face]:
                [*(9 / 8 * n for n in lengths), thickness], 0.60)
 
 
-def second_print() -> Face:
-    """Return marker 0 of DICT_4X4_50 alone, in the body frame of a leader that would carry it."""
-    code = draw_marker('DICT_4X4_50', 0, 6) > 127
-    return marker_print(np.pad(code, 1, constant_values=True).astype(float), SIDE_LENGTH / 6)
+def second_print(dictionary: str = 'DICT_4X4_50') -> Face:
+    """Return marker 0 of a dictionary alone, in the body frame of a leader that would carry it."""
+    cells = marker_cells(dictionary)
+    code = draw_marker(dictionary, 0, cells) > 127
+    return marker_print(np.pad(code, 1, constant_values=True).astype(float), SIDE_LENGTH / cells)
 
 
 def leader(marker: Face | None = None) -> list[Face]:

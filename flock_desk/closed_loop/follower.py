@@ -42,7 +42,7 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
-from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
 from flock_follower.geometry import (
     Array,
     quaternion_from_yaw,
@@ -136,7 +136,7 @@ class SimulatedFollower(Listener):
     def _new_control(self) -> Gate:
         """Return the control of a bridge that starts."""
         gate = Gate(self._limits)
-        gate.compensates_wind = not PX4.compensates_wind
+        gate.autopilot = AutopilotTraits(needs_wind_offset=not PX4.compensates_wind)
         return gate
 
     def sense(self, now: float, own: OwnState | None) -> None:

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_desk.camera.lens import Camera
+from flock_desk.camera.renderer import leader as leader_faces
 from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
 from flock_desk.closed_loop.flown import EmbeddedVehicle, FlownLeader, FlownVehicle
 from flock_desk.closed_loop.scenario_run import BEFORE_START, ScenarioRun
@@ -174,11 +175,18 @@ def _pose(state: Odometry) -> Transform:
     return Transform(quaternion_to_matrix(state.quaternion), state.position)
 
 
-def real_time_camera(seed: int, prints: Sequence[Print] = ()) -> Renderer:
-    """Return a camera of the sample bag's kind, in its world, that renders in milliseconds."""
+def real_time_camera(seed: int, prints: Sequence[Print] = (),
+                     dictionary: str = 'DICT_4X4_50') -> Renderer:
+    """
+    Return a camera of the sample bag's kind, in its world, that renders in milliseconds.
+
+    :param dictionary: of the leader's marker.
+    :raises ValueError: if it is unknown.
+    """
     placed = [([second_print()], Transform.from_quaternion(
         np.array(each.position), quaternion_from_yaw(each.yaw))) for each in prints]
-    return Renderer(Camera(), CAMERA_SENSOR, seed=seed, fineness=2, prints=placed)
+    return Renderer(Camera(), CAMERA_SENSOR, seed=seed, fineness=2, prints=placed,
+                    body=leader_faces(second_print(dictionary)))
 
 
 def calibration(camera: Camera) -> dict[str, Any]:

@@ -45,6 +45,7 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
+from flock_follower.files import resource
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
@@ -60,6 +61,7 @@ from flock_follower.messages import (
     STATE,
     TRAJECTORY,
 )
+from flock_follower.neighbors_file import load, NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.parameters.spec import filled
@@ -70,6 +72,7 @@ from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.parameter_table import planner_params
+from flock_follower.pose_messages import from_pose, POSE_TYPES, stamp_of
 from flock_follower.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
@@ -87,6 +90,7 @@ INVALID_ODOMETRY: Final = 'invalid odom'
 IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 CAMERA_INFO: Final = TYPES['camera_info']
 NEEDED: Final = (RAW_IMAGES, 'camera_info', 'odom')
+POSES: Final = 'poses'  # of another detector; its neighbor stands in place of a camera
 TRUTHS: Final = ('truth/odom', 'truth/neighbors')
 #: Where a message with a header goes on after encapsulation and stamp.
 _AFTER_STAMP: Final = 12
@@ -94,7 +98,8 @@ _NOTHING = (math.nan,) * 3
 
 
 def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
-                several: Sequence[CameraValues] = ()) -> dict[str, tuple[str, str]]:
+                several: Sequence[CameraValues] = (),
+                config: NeighborConfig | None = None) -> dict[str, tuple[str, str]]:
     """
     Return the topics of a bag that a follower uses, and the truth.
 
@@ -102,6 +107,7 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
 
     :param remaps: their names in the bag, by ours, if they differ.
     :param several: cameras with topics of their own, in place of the only one.
+    :param config: the neighbors: with markers, or with topics of other detectors.
     :returns: our name of each topic, ``image_raw`` for all images, and the camera's name, ''
         of the only one.
     :raises BagError: naming topics that are missing, or of another type, and those that may be.
@@ -121,20 +127,26 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     wanted = wanted or [(RAW_IMAGES, '', images or [names[kind] for kind in IMAGES]),
                         ('camera_info', '', [names['camera_info']])]
     wanted += [(ours, '', [names[ours]]) for ours in ('odom', *TRUTHS, 'ranges')]
+    neighbors = config.neighbors if config else ()
+    needed = NEEDED if not config or any(n.markers for n in neighbors) else ('odom',)
+    wanted += [(POSES, n.name, [full_name(n.source.topic, namespace)])
+               for n in neighbors if n.source is not None and n.source.topic]
     used: dict[str, tuple[str, str]] = {}
     faults: dict[str, str] = {}
     for ours, camera_name, choices in wanted:
         full = next((full for full in choices if full in published), '')
-        types = [TYPES[kind] for kind in (IMAGES if ours == RAW_IMAGES else (ours,))]
+        types = [*POSE_TYPES] if ours == POSES else [
+            TYPES[kind] for kind in (IMAGES if ours == RAW_IMAGES else (ours,))]
         if full and published[full] in types:
             used[full] = ours, camera_name
         elif full:
             faults[ours] = f'{full} holds {published[full]}, not {types[0]}'
-        elif ours in NEEDED:
-            whose = f' of camera {camera_name}' if camera_name else ''
+        elif ours in (*needed, POSES):
+            whose = f' of camera {camera_name}' if camera_name and ours != POSES else ''
             faults[ours] = f'no message on {" or ".join(choices)}{whose}'
     if faults:
-        offers = filter(None, (offer(ours, published, used) for ours in faults))
+        offers = filter(None, (
+            offer(ours, published, used) for ours in faults if ours != POSES))
         raise BagError(f'{bag.path}: ' + '; '.join(
             [*faults.values(), f'it holds {", ".join(published)}', *offers]))
     whole = all(names[truth] in used for truth in TRUTHS)
@@ -240,6 +252,8 @@ class Evaluation(Listener):
                 state = self.source.take(message, time)
             elif name == 'ranges':
                 measured = from_range(message)
+            elif name == POSES:
+                pose = from_pose(message)
             else:
                 stamp = read_stamp(message.header.stamp)
         except ValueError as error:
@@ -256,6 +270,8 @@ class Evaluation(Listener):
                 self.follower.odometry(time, state)
         elif name == 'ranges':
             self.follower.range(time, measured)
+        elif name == POSES:
+            self.follower.pose(time, camera, pose)
         elif name == RAW_IMAGES:
             self.follower.image(time, message if pixels is None else pixels, stamp, camera)
 
@@ -365,8 +381,10 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     """
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
+        config = neighbors_of(values['relative_pose'])
         used = topics_used(bag, namespace, remaps, [
-            camera for camera in cameras(values['relative_pose']) if camera.name])
+            camera for camera in cameras(values['relative_pose']) if camera.name], config)
+        frames = full_name(config.frames_topic, namespace) if config.frames_topic else ''
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
             evaluation = Evaluation(bag, values, writer)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
@@ -378,7 +396,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
             if checked:
                 evaluation.own = OwnMotion(evaluation.source)
                 system = RecordedSystem(bag, values, '', namespace, remaps, evaluation.own)
-            _play(bag, used, evaluation, system)
+            _play(bag, used, evaluation, system, frames)
             if system is not None:
                 evaluation.findings = system.findings()
         (Path(unfinished) / 'result' / 'result.mcap').replace(result)
@@ -387,12 +405,13 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
-          system: RecordedSystem | None) -> None:
+          system: RecordedSystem | None, frames: str = '') -> None:
     message, pixels, began = None, None, False
     line = LiveLine(sys.stderr)
     line.due(time.monotonic())  # a short bag needs no line
     shown = False
-    for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
+    for topic, msgtype, stamp, data in bag.messages([
+            *used, *(system.topics if system else ()), *([frames] if frames else ())]):
         if line.due(time.monotonic()):
             done = (stamp - bag.start_ns) / max(bag.end_ns - bag.start_ns, 1)
             line.show(f'{done:4.0%} of {bag.path.name}')
@@ -408,9 +427,16 @@ def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
                 began = True
                 evaluation.begin(stamp)
             evaluation.take(name, stamp, msgtype, data, camera, message, pixels)
+        if topic == frames and began:
+            evaluation.follower.source_frame(stamp, stamp_of(data))
     if shown:
         line.end()
     evaluation.follower.finish()
+
+
+def neighbors_of(perception: Mapping[str, Any]) -> NeighborConfig:
+    """Return the neighbors of the parameters of relative_pose."""
+    return load(perception['neighbors_file'] or resource('config/neighbors.yaml'))
 
 
 def _norm(vector: Array | None) -> float:

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 from itertools import pairwise
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -60,6 +61,8 @@ MARGIN = 1.5  # s beyond the duration: the simulator receives the engagement a l
 GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
 COUNTER_PERIOD = 1.2  # s in which every node publishes its counters once more
+VIEW = 'view'
+DETECTED = 'DICT_APRILTAG_36h11'  # of the leader's marker, for another detector
 T = TypeVar('T')
 
 
@@ -119,7 +122,7 @@ def spacing(scenario: Scenario) -> float:
 
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
-        external: External | None = None, followers: int = 1
+        external: External | None = None, followers: int = 1, detector: Path | None = None
         ) -> Flown:
     """
     Fly a scenario through all nodes, leaving logs and records in ``out``.
@@ -127,6 +130,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
     :param name: of the scenario, as the simulator shall load it.
     :param external: the autopilot that flies the follower; None: the embedded one.
     :param followers: how many fly in a column; the logs of each are in ``namespaces``.
+    :param detector: a program whose poses replace the marker's, see ``with_detector``.
     :raises RuntimeError: if a process ends early or a service refuses, with the reason.
     :raises TooBusyError: if something came too late because the machine was too busy.
     """
@@ -139,8 +143,11 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             parameters = parameters_of_nodes(
                 scenario, name, seed + i, duration, out / namespace, external,
                 fleet[i - 1] if i else '', i + 1)
+            if detector is not None:
+                parameters = with_detector(parameters, detector)
             start(processes, parameters, RECORDED,
                   namespace, show=i == 0)
+        start_view(processes, fleet[0])
         try:
             for namespace in reversed(fleet):  # the first one flies off when it is engaged
                 prefix = f'/{namespace}/' if namespace else ''
@@ -169,6 +176,8 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         if any(simulator.returncode for simulator in simulators_of(processes)):
             raise RuntimeError('the simulator failed')
         exit_codes = processes.stop_all()
+        for of_each in cores, exit_codes:
+            of_each.pop(VIEW, None)  # the page is no part of the flight
         for recorder, code in exit_codes.items():
             if code == 1 and recorder.endswith('recorder'):
                 raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
@@ -193,10 +202,22 @@ def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorde
     for node, values in parameters.items():
         simulates = node == 'simulator'
         processes.start(
-            f'{prefix}{node}',
-            'flock_desk.simulator_node' if simulates else f'flock_follower.nodes.{node}',
+            f'{prefix}{Path(node).stem}',
+            'flock_desk.simulator_node' if simulates else node if node.endswith('.py') else (
+                f'flock_follower.nodes.{node}'),
             ['--ros-args', *renamed, *(word for value in values for word in ('-p', value))],
             show=show and simulates, ends=simulates)
+
+
+def start_view(processes: Processes, namespace: str = '') -> None:
+    """
+    Start the live page, unless the variable VIEW of the environment is ``no``.
+
+    It prints its address, or one line if it cannot serve: the flight goes on without it.
+    """
+    if os.environ.get('VIEW') != 'no':
+        renamed = ['--ros-args', '-r', f'__ns:=/{namespace}'] if namespace else []
+        processes.start(VIEW, 'flock_follower.nodes.view', renamed, show=True, ends=True)
 
 
 def simulators_of(processes: Processes) -> list[subprocess.Popen[bytes]]:
@@ -236,13 +257,28 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
             vehicle.append(f'leader_truth_connection:={external.leader_truth}')
     return {
         'relative_pose': [],
-        'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
+        'planner': [*limits, f'K:={flight.K}', f'beta:={flight.beta}', f'd0:={flight.d0}',
+                    f'd1:={flight.d1}',
                     # No wider than the gate's, which would be a warning.
                     f'altitude_min:={max(flight.altitude_min, GateLimits.height_min)}'],
         'mavlink_bridge': [*limits, *envelope, *bridge],
         'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
                       f'log:={out / "flight.npz"}'],
     }
+
+
+def with_detector(parameters: Mapping[str, list[str]], detector: Path) -> dict[str, list[str]]:
+    """
+    Return the parameters of the nodes with another detector, a program, among them.
+
+    The neighbors' file has its name with .yaml; the simulator draws an AprilTag for it.
+    """
+    neighbors = f'neighbors_file:={detector.with_suffix(".yaml").resolve()}'
+    added = {'relative_pose': neighbors, 'planner': neighbors,
+             'simulator': f'dictionary:={DETECTED}'}
+    return {str(detector.resolve()): [], **{
+        node: [*values, *([added[node]] if node in added else [])]
+        for node, values in parameters.items()}}
 
 
 def take_off(processes: Processes) -> None:

@@ -164,13 +164,15 @@ class FrameErrors:
         return table
 
     def _visible(self, neighbor: MarkedNeighbor, truth: _States) -> Array:
-        """Return for every image whether a marker is in view, NaN if there is no truth."""
+        """Return for every image whether a marker, if any, is in view, NaN without truth."""
         visible, cameras = np.zeros(len(truth.position), dtype=bool), np.array(self._cameras)
         calibrated = {name: model for name, model in self.models.items() if model is not None}
         for name, model in calibrated.items():
             for marker in neighbor.markers:
                 visible |= (cameras == name) & _marker_visible(
                     marker, model, self._T_camera_body[name], truth.position, truth.rotation)
+        if not neighbor.markers:  # whatever another detector reports, it saw
+            visible[:] = True
         return np.where(np.isfinite(truth.position[:, 0]), visible, np.nan)
 
 

@@ -104,7 +104,7 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
         spans = np.ptp(x, axis=(0, 1))
         axis.margins(0.12)
         if spans.max() > SLIM * spans.min():  # at one scale the panel would be empty
-            axis.text(1.03, 0.5, 'scales differ', fontsize=7, rotation=90, va='center',
+            axis.text(1.03, 0.5, 'x and y scales differ', fontsize=7, rotation=90, va='center',
                       transform=axis.transAxes)
         else:
             axis.set_aspect('equal', adjustable='datalim')
@@ -170,6 +170,9 @@ def agreement(runs: Runs, end: float) -> Figure:
     shown = law.time <= end
     above.plot(law.time[shown], law.lyapunov[shown], color=INK)
     above.set(ylabel='$W$ of the law [m/s]')
+    above.set_title('$W = \\Lambda + \\frac{1}{2}\\sum_{i>j}\\left[(r_{ij}^2 - d_0)^{-1} + '
+                    '(d_1 - r_{ij}^2)^{-1}\\right]$ decreases')
+    below.set_title('disagreement $\\Lambda = \\sqrt{\\sum_i |v_i - \\bar{v}|^2}$')
     for (name, run), (color, dash) in zip(runs.items(), ((INK, '-'), *COLORS[:2])):
         m = run.metrics
         below.semilogy(m.time, m.disagreement / m.disagreement[0], color=color,
@@ -212,7 +215,7 @@ def flock(run: Simulation) -> Figure:
     below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
     agreeing.plot(m.time, m.order, color=INK, label='order parameter')
     agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLORS[2][0],
-                  linestyle=COLORS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
+                  linestyle=COLORS[1][1], label='disagreement $\\Lambda(t) / \\Lambda(0)$')
     agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
     for axis in (below, agreeing):
         axis.legend(**_ABOVE)

@@ -178,11 +178,12 @@ class Processes:
     def start(self, name: str, module: str, arguments: Sequence[str] = (), *,
               show: bool = False, ends: bool = False) -> subprocess.Popen[bytes]:
         """
-        Start ``python -m MODULE ARGUMENTS``.
+        Start ``python -m MODULE ARGUMENTS``; a module that ends with .py is a file.
 
         :param show: leave its output on the terminal. :param ends: whether it ends by itself.
         """
-        command = [sys.executable, '-m', module, *arguments]
+        program = [module] if module.endswith('.py') else ['-m', module]
+        command = [sys.executable, *program, *arguments]
         with open(self.log_folder / f'{name}.log', 'wb') as log:
             output = {} if show else {'stdout': log, 'stderr': subprocess.STDOUT}
             # A session of its own: Ctrl-C in the terminal reaches us, and we stop the children.

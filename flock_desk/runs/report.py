@@ -55,7 +55,8 @@ td { padding: .12em 0; border-bottom: 1px solid #eee; } td + td { text-align: ri
      max-width: 14em; }
 body { overflow-wrap: anywhere; }
 @media (max-width: 700px) { figure { width: 100%; margin: 0 0 1em; } .bounds td + td { white-space:
-       normal; } .bounds code { display: none; } }
+       normal; } .bounds code { display: none; } .plot { overflow-x: auto; }
+       .plot img { max-width: none; width: 880px; } }
 .ok { color: #00734d; } .FAILED { color: #b03a00; font-weight: 600; }
 """
 
@@ -193,7 +194,7 @@ def _chapter(chapter: Chapter) -> str:
         image = (f'<img alt="{escape(description)}" src="data:image/{kind};base64,'
                  f'{base64.b64encode(data).decode("ascii")}">')
         parts.append(f'<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>'
-                     if caption else image)
+                     if caption else f'<div class="plot">{image}</div>')
     return ''.join(parts)
 
 

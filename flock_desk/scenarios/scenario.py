@@ -275,6 +275,7 @@ class Operation(Part):
 class FlightParams(Part):
     """The planner's parameters that a scenario sets; the others keep their defaults."""
 
+    K: float = 1.0
     beta: float = 0.25
     d0: float = 1.0
     d1: float = 8.0
@@ -290,8 +291,8 @@ class FlightParams(Part):
 
     def planner(self, guard: bool) -> PlannerParams:
         """Return the parameters to plan with."""
-        return PlannerParams(FlockingParams(beta=self.beta, d0=self.d0, d1=self.d1), guard,
-                             a_max=self.a_max, v_max=self.v_max,
+        law = FlockingParams(K=self.K, beta=self.beta, d0=self.d0, d1=self.d1)
+        return PlannerParams(law, guard, a_max=self.a_max, v_max=self.v_max,
                              altitude_min=self.altitude_min, altitude_max=self.altitude_max)
 
     def __post_init__(self) -> None:

@@ -118,7 +118,7 @@ class Bag(AbstractContextManager['Bag']):
                 self.topics[name] = Topic(
                     name, connections[0].msgtype, max(
                         sum(c.msgcount for c in each) for each in (connections, announced)),
-                    any(map(_latched, (*connections, *announced))))
+                    any(map(_is_latched, (*connections, *announced))))
 
     @property
     def duration_ns(self) -> int:
@@ -301,7 +301,7 @@ def absolute(topic: str) -> str:
     return f'/{topic.strip("/")}'
 
 
-def _latched(connection: Connection) -> bool:
+def _is_latched(connection: Connection) -> bool:
     if isinstance(connection.ext, ConnectionExtRosbag1):
         return bool(connection.ext.latching)
     return any(qos.durability is QosDurability.TRANSIENT_LOCAL

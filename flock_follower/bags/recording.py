@@ -67,7 +67,7 @@ class FlightRecording:
         self.folder = folder
         self.path: Path | None = None
         self._disk_used, self._disk_free = disk_used, disk_free
-        self._lock = _locked(folder)
+        self._lock = _lock_folder(folder)
         self._files: list[McapFile] = []  # of the current recording
         self._file: McapFile | None = None  # the last of them, while it is open
         self._last = 0
@@ -110,7 +110,7 @@ class FlightRecording:
             message.topic: message.data for message in messages if message.topic.latched})
         # Readers need files that have no index in order.
         try:
-            file = self._opened(first)
+            file = self._open_file(first)
             file.write([message._replace(stamp_ns=max(message.stamp_ns, self._last))
                         for message in (*(() if file.counts else latched), *messages)])
         except OSError:
@@ -140,7 +140,7 @@ class FlightRecording:
         elif path is not None:
             shutil.rmtree(path, ignore_errors=True)
 
-    def _opened(self, stamp_ns: int) -> McapFile:
+    def _open_file(self, stamp_ns: int) -> McapFile:
         """Return the file to write to."""
         if self.path is None:
             numbers = [int(path.name.partition('_')[0]) for path in self._recordings()]
@@ -204,7 +204,7 @@ def _free(folder: Path) -> int:
     return room.f_bavail * room.f_frsize
 
 
-def _locked(folder: Path) -> int:
+def _lock_folder(folder: Path) -> int:
     """Make a folder and lock it for as long as the returned file is open."""
     folder.mkdir(parents=True, exist_ok=True)
     opened = os.open(folder, os.O_RDONLY)

@@ -119,15 +119,15 @@ class SequentialReader:
                 if connection.id in wanted and (start or 0) <= stamp < stop:
                     heapq.heappush(held, (stamp, number, connection, data))
                 while held and held[0][0] <= newest - self.disorder:
-                    yield _stamped(heapq.heappop(held))
+                    yield _message_of(heapq.heappop(held))
             while held:
-                yield _stamped(heapq.heappop(held))
+                yield _message_of(heapq.heappop(held))
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
 
 
-def _stamped(held: tuple[int, int, Connection, bytes]) -> tuple[Connection, int, bytes]:
+def _message_of(held: tuple[int, int, Connection, bytes]) -> tuple[Connection, int, bytes]:
     stamp, _, connection, data = held
     return connection, stamp, data
 

@@ -166,6 +166,10 @@ class Collector:
             camera = camera_model(seen)
         except ValueError:
             camera = None  # reported with the calibration
+        seen.sources = {n.name: n.source.topic
+                        for n in config.neighbors if n.source is not None}
+        if not seen.has_markers:
+            self._kept.clear()
         thoroughly = partial(everywhere, markers=[marker for _, marker in markers.values()])
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary)

@@ -193,7 +193,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
                       if n == 0 or up is None or turn[2].dot(up) > 0.5])
     to_optical = turns.transpose(0, 2, 1) @ R_base_optical
     offsets = np.arange(-MAX_OFFSET, MAX_OFFSET + 1e-9, OFFSET_STEP)
-    moves = [_turned(rows, path, offset) for offset in offsets.tolist()]
+    moves = [_base_rotations(rows, path, offset) for offset in offsets.tolist()]
     shares = _shares(moves, to_optical)
     if shares.max() < 0.0:
         return None
@@ -202,9 +202,9 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     R, curve = to_optical[best], shares[:, best]
     for _ in range(2):  # an error of the mounting looks like an offset, too
         offset = _summit(offsets, curve)
-        turned, known = _turned(rows, path, offset)
+        turned, known = _base_rotations(rows, path, offset)
         moved = np.diff(known[:, :2]) * path.motion(known[:, :2].mean(axis=1) - offset)[1]
-        solution, covariance = _refined(
+        solution, covariance = _fit_mounting(
             turned @ R, moved @ R, known[:, 4:].reshape(-1, PART_ROWS * PART_COLUMNS, 3), camera)
         curve = _shares(moves, R @ rotation_vector_to_matrix(solution[:3]))
     rates = np.sqrt(np.mean((turned @ R)[:, :2]**2, axis=0))
@@ -216,8 +216,8 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
         math.hypot(ERROR_FACTOR * math.sqrt(covariance[3, 3]), error))
 
 
-def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
-             ) -> tuple[Array, Array]:
+def _fit_mounting(turned: Array, moved: Array, parts: Array, camera: CameraModel
+                  ) -> tuple[Array, Array]:
     """
     Return mounting (3,), rad, zoom and each 1 / depth by least squares; covariance of the first 4.
 
@@ -255,7 +255,7 @@ def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
     return solution, np.linalg.inv(information)[:4, :4] + np.outer(effect, effect)
 
 
-def _turned(rows: Array, path: OwnPath, offset: float) -> tuple[Array, Array]:
+def _base_rotations(rows: Array, path: OwnPath, offset: float) -> tuple[Array, Array]:
     """Return rotation vectors in base_link (n, 3), and the rows for which they are known."""
     (q1, known1), (q2, known2) = (path.attitude(rows[:, k] - offset) for k in (0, 1))
     known = known1 & known2

@@ -65,7 +65,7 @@ _MAX_CORRELATION = 0.9  # of neighboring residuals, at most
 SIZE_WARNING = 0.05
 #: Relative error of the size from which on there is an error.
 SIZE_ERROR = 0.1
-HOW: Final = 'stand the leader on the ground, and carry the camera towards it by 1 m, to and fro'
+HOW: Final = 'stand the leader on the ground, and move the camera 1 m towards it and back'
 
 
 class Ratio(NamedTuple):

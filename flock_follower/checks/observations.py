@@ -167,6 +167,8 @@ class Observations:
     dictionary: str = ''
     marker_sides: dict[int, float] = field(default_factory=dict)
     """The configured length of the sides of each neighbor's marker, m, by its id."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Topic of the poses by another detector, '' for a frame on /tf, by neighbor."""
     pictures: list[Picture] = field(default_factory=list)
     shifts: list[list[float]] = field(default_factory=list)
     sightings: list[list[float]] = field(default_factory=list)
@@ -184,6 +186,11 @@ class Observations:
     """By how much the clock was set back while a bag was recorded, s: its messages are mixed."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
+
+    @property
+    def has_markers(self) -> bool:
+        """Return whether images are needed: a neighbor has a marker."""
+        return bool(self.marker_sides) or not self.sources
 
     def status(self, node: str) -> NodeStatus | None:
         """Return the newest status of a node of ours, by its plain name, or None."""

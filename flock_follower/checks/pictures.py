@@ -47,15 +47,13 @@ def camera_model(seen: Observations) -> CameraModel:
     info = seen.calibration
     if info is None:
         raise ValueError('no calibration')
-    return CameraModel.from_calibration(
-        info.k, info.d, info.distortion_model, info.width, info.height, info.p,
-        rectified=bool(seen.value('relative_pose', 'rectified', False))).scaled(
-            info.roi.x_offset, info.roi.y_offset, info.roi.width or info.width,
-            info.roi.height or info.height, max(info.binning_x, 1), max(info.binning_y, 1))
+    return CameraModel.from_info(info, bool(seen.value('relative_pose', 'rectified', False)))
 
 
 def check_pictures(seen: Observations) -> Iterator[Finding]:
     """Check calibration, images and markers."""
+    if not seen.has_markers:
+        return
     good = [picture for picture in seen.pictures if not picture.fault]
     if faults := [picture.fault for picture in seen.pictures if picture.fault]:
         yield Finding(ERROR, 'images', faults[0], 'an encoding that can be read',

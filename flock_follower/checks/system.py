@@ -19,12 +19,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from flock_follower.bridge_keys import (
+from flock_follower.bridge_state import (
+    ARMED,
     LINK_FAULT,
     MISSING,
     NO_ANSWERS,
     NOT_READY,
     PARAMETER,
+    read_flag,
     REFUSED,
     UNANSWERED,
     UNPROVEN,
@@ -170,5 +172,5 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         if key in values:
             yield judged(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
                          wanted, wanted, advice)
-        elif key == REFUSED or values.get('armed') != 'True':
+        elif key == REFUSED or not read_flag(values, ARMED):
             yield Finding(UNMEASURED, what, 'not reported yet', wanted)

@@ -31,6 +31,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations, TopicSeen
 from flock_follower.checks.reach import Reach
+from flock_follower.pose_messages import POSE_TYPES
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS, RAW_IMAGES, TYPES
 
@@ -65,13 +66,17 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
             'record again, and synchronize the clock before')
     elif seen.gaps:
         yield _gaps(seen)
-    for name in (seen.image_name, 'camera_info', 'odom'):
-        yield _needed(seen, name)
+    for name in (seen.image_name, 'camera_info', 'odom') if seen.has_markers else ('odom',):
+        yield _check_published(seen, name)
+    for name, topic in seen.sources.items():
+        if topic:
+            yield _check_source(seen, name, topic)
     late = float(seen.value('planner', 'odom_timeout', 0.3))
-    yield from _stream(
-        seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
-        faster='raise the frame rate of the camera; reduce the exposure time in the dark',
-        sooner='send smaller images, or gray ones; have the camera on this computer')
+    if seen.has_markers:
+        yield from _stream(
+            seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
+            faster='raise the frame rate of the camera; reduce the exposure time in the dark',
+            sooner='send smaller images, or gray ones; have the camera on this computer')
     yield from _stream(
         seen, 'odom', seen.topic('odom'), rates=(18.0, 8.0), latencies=(0.5 * late, 0.8 * late),
         faster='raise the output rate of the odometry (IMU rate, if its driver offers that)',
@@ -79,6 +84,22 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
         'message if it can')
     if seen.live:
         yield from _publishers(seen)
+
+
+def _check_source(seen: Observations, name: str, topic: str) -> Finding:
+    """Check the topic of the poses of a neighbor that another detector measures."""
+    full = full_name(topic, seen.namespace)
+    found = seen.topics.get(full, TopicSeen())
+    number = len(found.publishers)
+    usable = {*POSE_TYPES} & {*found.types}
+    return first(
+        f'poses of {name}', 'one publisher of poses',
+        (not number and not seen.live, ERROR, f'the bag lacks {full}', 'record it'),
+        (not number, ERROR, f'no node publishes {full}', 'start the other detector'),
+        (number > 1, ERROR, f'{number} publishers of {full}: none is used', 'end all but one'),
+        (not usable, ERROR, f'{full} holds {", ".join(found.types)}',
+         f'have it send {POSE_TYPES[0]}'),
+        (True, OK, f'{full}; without a marker the guard keeps no viewing angle', ''))
 
 
 def check_nodes(seen: Observations) -> Finding:
@@ -138,7 +159,7 @@ def _gaps(seen: Observations) -> Finding:
         'recording')
 
 
-def _needed(seen: Observations, name: str) -> Finding:
+def _check_published(seen: Observations, name: str) -> Finding:
     """Check that a topic is published, and that messages arrive."""
     topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
     what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name

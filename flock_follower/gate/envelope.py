@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import math
 from typing import Final, NamedTuple
 
+from flock_follower.gate.obstacle import Obstacle
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import product, Side
@@ -358,7 +359,9 @@ class HeightEstimator:
         """Return whether a height that was known is not received any more."""
         return self._referred and self.height(now) is None
 
-    def lost(self, now: float) -> str:
-        """Return why a height that was known cannot be used at ``now``, or ''."""
+    def obstacle(self, now: float) -> Obstacle | None:
+        """Return why a height that was known cannot be used at ``now``, or None."""
+        if self.missing(now):
+            return Obstacle.HEIGHT_STALE
         jumped = self._reference is not None and now - self.stepped < STEP_PAUSE
-        return first_reason((self.missing(now), 'height stale'), (jumped, 'height jumped'))
+        return Obstacle.HEIGHT_JUMPED if jumped else None

@@ -31,8 +31,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
+from flock_follower.gate.permission import Cause
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.ranges import Checked, parameter, Range
 
@@ -101,14 +102,27 @@ class EndParams(Checked):
         'ignores slow sticks', live=False)
 
 
+class Handover(NamedTuple):
+    """Why the bridge itself hands the vehicle over, and what follows."""
+
+    why: str = ''
+    """As text; '' for no handover."""
+    action: str = HOLD
+    """HOLD, or LAND: a landing after the hold mode."""
+    cause: Cause = Cause.ENDED
+    """For the permission."""
+
+
+NO_HANDOVER: Final[Handover] = Handover()
+
+
 class FlightEnd:
     """Follows one bridge's flights; times are monotonic, s."""
 
     def __init__(self, params: EndParams | None = None) -> None:
         self.params = params or EndParams()
-        self.why = ''
-        """Why the bridge has handed over, since offboard was last requested; '' if it has not."""
-        self._action = HOLD
+        self.handover = NO_HANDOVER
+        """The handover since offboard was last requested, if any."""
         self._asked = -math.inf
         self._held_since = math.inf
         self._low_since = math.inf
@@ -134,52 +148,61 @@ class FlightEnd:
 
     def begin(self) -> None:
         """Reset after a request of an operator."""
-        self.why, self._action, self._held_since = '', HOLD, math.inf
+        self.handover, self._held_since = NO_HANDOVER, math.inf
+
+    @property
+    def why(self) -> str:
+        """Return why the bridge has handed over since offboard was last requested, or ''."""
+        return self.handover.why
 
     def reason(self, active_since: float, command_time: float, handover: str,
-               now: float) -> tuple[str, str]:
+               now: float) -> Handover:
         """
-        Return why a vehicle that flies our setpoints must be handed over, or '', and the action.
+        Return whether, and why, a vehicle that flies our setpoints must be handed over.
 
         :param active_since: time from which it has been ACTIVE, s; infinite while it is not.
         :param command_time: time of the last accepted command, s.
         :param handover: the gate's reason for a handover, or ''.
         """
         if handover:
-            return handover, HOLD
+            return Handover(handover)
         if low := self.battery_low(now):
-            return low, self.params.battery_action
+            return Handover(low, self.params.battery_action)
         late, why = now - command_time > COMMAND_TIMEOUT, f'no command for {COMMAND_TIMEOUT:g} s'
         if command_time < active_since:
             timeout = self.params.engage_timeout
             late = now - active_since > timeout
             why = f'no command within engage_timeout = {timeout:g} s'
-        return (why, self.params.leader_lost_action) if late else ('', HOLD)
+        return Handover(why, self.params.leader_lost_action) if late else NO_HANDOVER
 
-    def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
+    def step(self, flies: bool, pending: bool, handover: Handover, held_mode: str,
              status: VehicleStatus, now: float) -> str:
         """
         Return the request to the autopilot at ``now``: HOLD, LAND or '' for none.
 
         :param flies: whether the vehicle, as far as known, flies our setpoints.
         :param pending: whether a request that ends the flight is open.
-        :param why: why it must be handed over, or ''; and the ``action`` that follows.
+        :param handover: what ``reason`` requires now.
         :param held_mode: the mode that the handover requested and reached, or ''.
         :param status: of the vehicle.
         """
         if flies:
-            why, action = (why, action) if why else (self.why, self._action)
-            if not why or pending or now - self._asked < RETRY_PERIOD:
+            handover = handover if handover.why else self.handover
+            if not handover.why or pending or now - self._asked < RETRY_PERIOD:
                 return ''
-            self.why, self._action, self._asked = why, action, now
+            self.handover, self._asked = handover, now
             self._held_since = math.inf
             return HOLD
-        if not self.why or self._action != LAND or pending:
+        if not self.why or self.handover.action != LAND or pending:
             return ''
         self._held_since = min(self._held_since, now)
         if status.mode != held_mode or not status.armed:
-            self._action = HOLD  # an operator has decided otherwise
+            self._keep_hold()  # an operator has decided otherwise
         elif now - self._held_since >= LANDING_DELAY:
-            self._action = HOLD
+            self._keep_hold()
             return LAND
         return ''
+
+    def _keep_hold(self) -> None:
+        """Request no landing any more."""
+        self.handover = self.handover._replace(action=HOLD)

@@ -43,18 +43,41 @@ from flock_follower.gate.vehicle_status import VehicleStatus
 
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground'
-FELL_SILENT: Final[str] = 'fell silent'
 #: After a takeover offboard is refused for this long, s: another program must not undo it.
 TAKEOVER_TIME: Final[float] = 10.0
-TWO_COMMAND: Final[str] = 'two nodes command'
 #: The vehicle is braked if no message with the mode (HEARTBEAT, CURRENT_MODE) came for this, s.
 MODE_TIMEOUT: Final[float] = 3.0
 #: After this long without the mode, s, the permission ends: the pilot may have taken over.
 LONGEST_SILENCE: Final[float] = 5.0
-MODE_UNKNOWN: Final[str] = 'mode unknown'
 
 
-class Cause(NamedTuple):
+class Cause(enum.Enum):
+    """Why it is not ACTIVE."""
+
+    NOT_REQUESTED = enum.auto()
+    WAITING = enum.auto()
+    """Offboard was requested, and is not flown yet."""
+    FAILED = enum.auto()
+    """The vehicle refused the request, or did not execute it in time."""
+    ENDED = enum.auto()
+    """By a request for another end of the flight."""
+    STICK = enum.auto()
+    """By such a request because the pilot moved a stick."""
+    CONTESTED = enum.auto()
+    """Two nodes give commands."""
+    SILENT = enum.auto()
+    """The bridge fell silent, without a valid velocity."""
+    MODE_UNKNOWN = enum.auto()
+    LANDED = enum.auto()
+    DISARMED = enum.auto()
+    RESTARTED = enum.auto()
+    GIVEN_BACK = enum.auto()
+    """The vehicle left the mode after the end of the flight."""
+    TAKEN = enum.auto()
+    """The pilot, or a failsafe, left the mode."""
+
+
+class Taker(NamedTuple):
     """Who or what has changed the mode."""
 
     text: str
@@ -62,8 +85,8 @@ class Cause(NamedTuple):
     """Whether it is a pilot, or may be one."""
 
 
-UNKNOWN: Final[Cause] = Cause('pilot or failsafe: unknown', True)
-STICK: Final[Cause] = Cause('the pilot moved a stick', True)
+UNKNOWN: Final[Taker] = Taker('pilot or failsafe: unknown', True)
+STICK: Final[Taker] = Taker('the pilot moved a stick', True)
 
 
 class Phase(enum.Enum):
@@ -89,8 +112,12 @@ class Permission:
     """When the newest message with the mode was received since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
-    cause: Cause = UNKNOWN
+    cause: Cause | None = Cause.NOT_REQUESTED
+    """The same for code; None if it is ACTIVE."""
+    taker: Taker = UNKNOWN
     """While TAKEN_OVER, who has changed the mode."""
+    left_for: str = ''
+    """While TAKEN_OVER, the mode that was flown instead."""
 
     @property
     def streams(self) -> bool:
@@ -104,10 +131,11 @@ class Permission:
 
     def taken_over(self, now: float) -> str:
         """Return that the pilot took over too recently for offboard at ``now``, s, or ''."""
-        taken = self.phase is Phase.TAKEN_OVER or self.reason == STICK.text
-        if not taken or not self.cause.pilot or now - self.received >= TAKEOVER_TIME:
+        stick = self.cause is Cause.STICK
+        taken = self.phase is Phase.TAKEN_OVER or stick
+        if not taken or not self.taker.pilot or now - self.received >= TAKEOVER_TIME:
             return ''
-        unknown = self.cause == UNKNOWN and self.reason != STICK.text
+        unknown = self.taker == UNKNOWN and not stick
         who = 'the pilot, or a failsafe,' if unknown else 'the pilot'
         return (f'{who} took over {max(now - self.received, 0.0):.0f} s ago: refused for '
                 f'{TAKEOVER_TIME:g} s; hold and land stay available')
@@ -121,57 +149,61 @@ class Permission:
     def requested(self, time: float) -> Permission:
         """Permit setpoints for a request of offboard at a time, s."""
         return self if self.phase is Phase.ACTIVE else Permission(
-            Phase.READY, 'waiting for offboard mode', time)
+            Phase.READY, 'waiting for offboard mode', time, cause=Cause.WAITING)
 
     def failed(self, why: str) -> Permission:
         """End a request that the vehicle refused, or did not execute in time."""
         # A mode that is reached late has no effect then.
         ends = self.phase is Phase.READY and not self.obeyed
-        return Permission(reason=why) if ends else self
+        return Permission(reason=why, cause=Cause.FAILED) if ends else self
 
-    def ended(self, why: str) -> Permission:
+    def ended(self, why: str, cause: Cause = Cause.ENDED) -> Permission:
         """Brake after a request for hold, land, disarm or the end of the bridge."""
         if self.phase is Phase.READY and not self.obeyed:
-            return Permission(reason=why)
-        return replace(self, phase=Phase.GIVING_BACK, reason=why) if self.streams else self
+            return Permission(reason=why, cause=cause)
+        return self._giving_back(why, cause) if self.streams else self
+
+    def _giving_back(self, why: str, cause: Cause) -> Permission:
+        return replace(self, phase=Phase.GIVING_BACK, reason=why, cause=cause)
 
     def contested(self, who: str) -> Permission:
         """Brake, because two nodes give commands at once."""
-        return self if self.phase is not Phase.ACTIVE else replace(
-            self, phase=Phase.GIVING_BACK, reason=f'{TWO_COMMAND}: {who}')
+        return self if self.phase is not Phase.ACTIVE else self._giving_back(
+            f'two nodes command: {who}', Cause.CONTESTED)
 
     def blinded(self, why: str) -> Permission:
         """Fall silent without a valid velocity: only silence starts the failsafe."""
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
-        return Permission(reason=f'{FELL_SILENT}: {why}') if self.streams else self
+        return Permission(
+            reason=f'fell silent: {why}', cause=Cause.SILENT) if self.streams else self
 
     def unseen(self, silence: float) -> Permission:
         """Brake for good after a time, s, without the mode: the pilot may have taken over."""
         flown = self.phase in (Phase.READY, Phase.ACTIVE) and self.obeyed
-        return self if not flown or silence <= LONGEST_SILENCE else replace(
-            self, phase=Phase.GIVING_BACK,
-            reason=f'{MODE_UNKNOWN} for {silence:.0f} s, the pilot may have taken over')
+        return self if not flown or silence <= LONGEST_SILENCE else self._giving_back(
+            f'mode unknown for {silence:.0f} s, the pilot may have taken over',
+            Cause.MODE_UNKNOWN)
 
     def landed(self) -> Permission:
         """End a flight after a landing."""
-        return Permission(reason=ON_GROUND) if self.streams else self
+        return Permission(reason=ON_GROUND, cause=Cause.LANDED) if self.streams else self
 
     def restarted(self, why: str) -> Permission:
         """Reset: the autopilot, rebooted or replaced, has not received the request."""
-        return Permission(reason=why)
+        return Permission(reason=why, cause=Cause.RESTARTED)
 
-    def left(self, status: VehicleStatus, cause: Cause = UNKNOWN) -> Permission:
+    def left(self, status: VehicleStatus, taker: Taker = UNKNOWN) -> Permission:
         """End a flight whose mode the pilot or the autopilot has changed."""
-        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}: {cause.text}',
-                          received=self.received, cause=cause)
+        return Permission(Phase.TAKEN_OVER, _left_reason(status.mode, taker),
+                          received=self.received, cause=Cause.TAKEN, taker=taker,
+                          left_for=status.mode)
 
-    def attributed(self, cause: Cause, now: float) -> Permission:
-        """Name the cause of a takeover, found at ``now``, s; the time of a pilot counts anew."""
-        if self.phase is not Phase.TAKEN_OVER or cause == self.cause:
+    def attributed(self, taker: Taker, now: float) -> Permission:
+        """Name who took over, found at ``now``, s; the time of a pilot counts anew."""
+        if self.phase is not Phase.TAKEN_OVER or taker == self.taker:
             return self
-        left, _, _ = self.reason.partition(': ')
-        return replace(self, reason=f'{left}: {cause.text}', cause=cause, received=(
-            now if cause.pilot and not self.cause.pilot else self.received))
+        return replace(self, reason=_left_reason(self.left_for, taker), taker=taker, received=(
+            now if taker.pilot and not self.taker.pilot else self.received))
 
     def seen(self, status: VehicleStatus, received: float, airborne: bool | None) -> Permission:
         """
@@ -186,17 +218,28 @@ class Permission:
         if now.phase is Phase.GIVING_BACK:
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
-            if status.armed and now.reason == STICK.text:
+            if status.armed and now.cause is Cause.STICK:
                 return now.left(status, STICK)
-            if status.armed and now.reason.startswith(MODE_UNKNOWN):
+            if status.armed and now.cause is Cause.MODE_UNKNOWN:
                 return now.left(status)
-            return Permission(reason=f'given back ({now.reason})')
+            return Permission(reason=f'given back ({now.reason})', cause=Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):
-            return Permission(reason=ON_GROUND if status.armed else 'disarmed')
+            return _end_on_ground(status)
         if not status.offboard:
             return now.left(status) if now.obeyed else now
         if now.phase is Phase.ACTIVE:
-            return now if status.armed else Permission(reason='disarmed')
+            return now if status.armed else _end_on_ground(status)
         if airborne is None:
             return replace(now, obeyed=True, reason=f'{status.mode}, not reported to fly')
-        return replace(now, phase=Phase.ACTIVE, reason='', obeyed=True)
+        return replace(now, phase=Phase.ACTIVE, reason='', cause=None, obeyed=True)
+
+
+def _left_reason(mode: str, taker: Taker) -> str:
+    return f'offboard was left for {mode}: {taker.text}'
+
+
+def _end_on_ground(status: VehicleStatus) -> Permission:
+    """Return the permission of a vehicle that stands, or is disarmed."""
+    if not status.armed:
+        return Permission(reason='disarmed', cause=Cause.DISARMED)
+    return Permission(reason=ON_GROUND, cause=Cause.LANDED)

@@ -55,8 +55,6 @@ class Relative(NamedTuple):
     """Time flown without odometry, s; NaN: not permitted."""
     begins: bool = False
     """Whether it has just begun, so that no command can have arrived yet."""
-    marker_age: float = math.inf
-    """Age of the image that the command rests on, s."""
 
 
 class Reckoning:
@@ -116,11 +114,10 @@ class RelativeFlight:
         permitted = self.reckoning is not None and 0.0 <= lasted <= self._timeout
         return lasted if permitted else math.nan
 
-    def permission(self, source_time: float, now: float) -> Relative:
-        """Return the permission; ``source_time``, s, of the image that a command rests on."""
+    def permission(self, now: float) -> Relative:
+        """Return the permission at ``now``, s."""
         lasted = self.lasts(now)
-        return Relative(lasted, not math.isnan(lasted) and now - self._begun <= GRACE,
-                        now - source_time)
+        return Relative(lasted, not math.isnan(lasted) and now - self._begun <= GRACE)
 
     def update(self, active: bool, commanded: bool, usable: bool, height: float | None,
                now: float) -> None:

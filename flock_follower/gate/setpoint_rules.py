@@ -25,7 +25,7 @@ most important first: ``a_max`` and ``v_max``; the heights of the envelope; the 
 planner requests; the radius of the envelope; the rest of the command. The setpoint is that command
 plus the offset of the disturbance (``disturbance``), which does not move the vehicle: ``v_max``
 and the envelope bound the command alone, ``a_max`` bounds the sum. Vectors are ENU; ``decide``
-takes everything that it depends on as an argument.
+takes everything that it depends on as one ``Situation``.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ from flock_follower.command_messages import Command
 from flock_follower.gate import envelope
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.level_limit import limit_level
-from flock_follower.gate.permission import MODE_TIMEOUT, MODE_UNKNOWN
-from flock_follower.gate.relative_flight import Relative
+from flock_follower.gate.obstacle import Obstacle, Refusal
+from flock_follower.gate.permission import MODE_TIMEOUT
+from flock_follower.gate.situation import Situation
 from flock_follower.gate.velocity_check import (
     finite_vector,
     fresh,
@@ -61,7 +62,7 @@ from flock_follower.planner.limits import (
     SENT_INSIDE,
 )
 from flock_follower.planner.projection import product
-from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
+from flock_follower.ranges import THRUST_OFFSET_MAX
 
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
@@ -74,16 +75,6 @@ COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
 NONE: Final[str] = 'none'
-
-
-class AcceptedCommand(NamedTuple):
-    """A command that was accepted; times are on the monotonic clock."""
-
-    command: Command
-    time: float
-    """When it applies, s."""
-    source_time: float
-    """When the image it rests on was taken, s."""
 
 
 class Setpoint(NamedTuple):
@@ -99,68 +90,48 @@ class Setpoint(NamedTuple):
     """rad; None without one."""
     limited: str
     """The limits that changed it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
+    cause: Obstacle | None = None
+    """Why it is no command, for code; None if it is."""
 
 
-class Held(NamedTuple):
-    """Yaw and height to keep without a command; None if unknown."""
-
-    yaw: float | None = None
-    """rad."""
-    height: float | None = None
-    """m."""
-
-
-def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
-           command_age: float, link_age: float, mode_age: float, armed: bool, airborne: bool,
-           withheld: str, place: Location, unplaced: str, held: Held, relative: Relative,
-           offset: ArrayLike) -> Setpoint:
+def decide(situation: Situation) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
-    Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
+    Whatever the situation holds (NaN, infinities, wrong shapes, ages in the future), the
     acceleration is finite, at most ``a_max`` long, and does not point upwards on the ground; less
     the offset it never leads to a speed above ``v_max``.
-
-    :param full: the limits at start, for braking and separation; ``limits`` may be lower.
-    :param known: the vehicle's motion, as far as it is known.
-    :param command: the newest command; its time is ``command_age`` seconds ago.
-    :param link_age: time since the autopilot is missing, s.
-    :param mode_age: time since a message last had the mode, s: the pilot may have switched since.
-    :param armed: whether it is armed; before, setpoints are level.
-    :param airborne: whether it reports that it flies: on the ground PX4 interprets any upward
-        acceleration as a request to take off.
-    :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
-    :param place: its location in the envelope.
-    :param unplaced: why a height that was known is unknown now, or ''.
-    :param held: yaw and height to keep without a command.
-    :param relative: whether a command may rest on the marker alone.
-    :param offset: the acceleration (3,), m/s^2, that offsets the disturbance.
     """
+    known, place, held = situation.known, situation.place, situation.held
     yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None
-    if withheld:
-        return Setpoint(NONE, withheld, np.zeros(3), yaw, '')
-    if not armed:
-        return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
-    offset = _sane_offset(offset)
-    reason = _refusal(limits, known, command, command_age, link_age, mode_age, unplaced, relative,
-                      place, airborne)
-    if not reason and command is not None and command.relative:
-        return _relative(full, command, offset, place)
-    velocity = known.velocity
-    if not reason and command is not None and velocity is not None:
+    if situation.withheld:
+        return _no_command(NONE, Refusal(Obstacle.WITHHELD, situation.withheld), yaw)
+    if not situation.report.armed:
+        return _no_command(LEVEL, Refusal(Obstacle.DISARMED), yaw)
+    airborne, full = situation.report.airborne, situation.start_limits
+    offset = _sane_offset(situation.offset)
+    refusal = find_refusal(situation)
+    if refusal is None and situation.command is not None:
+        command = situation.command.command
+        if command.relative:
+            return _relative(full, command, offset, place)
+        assert known.velocity is not None  # else it is refused
         axis = _direction(command.separation_axis)
-        safe = _limited(limits if axis is None else full, np.asarray(command.acceleration),
-                        offset, velocity, place, axis)
+        safe = _limited(situation.limits if axis is None else full,
+                        np.asarray(command.acceleration), offset, known.velocity, place, axis)
         return Setpoint(COMMAND, '', _grounded(safe.acceleration, airborne),
                         wrap_angle(command.yaw), safe.reason)
+    refusal = refusal or Refusal(Obstacle.NO_COMMAND)
     estimated = known.braking
     if estimated is None:
-        if known.blind and not relative.begins:
-            return Setpoint(NONE, reason, np.zeros(3), yaw, '')
+        if known.blind and not situation.relative.begins:
+            return _no_command(NONE, refusal, yaw)
         # Without the offset of the thrust a level vehicle sinks or climbs.
         level = _with_offset(np.zeros(3), offset * [0.0, 0.0, float(airborne)], full.a_max, None)
-        return Setpoint(LEVEL, reason, _grounded(level, airborne), yaw, '')
-    nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
+        return _no_command(LEVEL, refusal, yaw, _grounded(level, airborne))
+    retreat = np.zeros(3) if situation.retreat is None else situation.retreat
+    nominal = brake(estimated.vector - limit_norm(retreat, full.v_max), full.a_max,
+                    situation.limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
         # A late rate makes the height swing, unless 1 / (2 w) is at least e times its age.
         frequency = min(HEIGHT_FREQUENCY, 0.5 / (estimated.margin + LATE_FACTOR * USUAL_AGE))
@@ -168,7 +139,14 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         if math.isfinite(climb):
             nominal[2] = climb
     safe = _limited(full, nominal, offset, estimated, place, None)
-    return Setpoint(BRAKE, reason, _grounded(safe.acceleration, airborne), yaw, safe.reason)
+    return _no_command(BRAKE, refusal, yaw, _grounded(safe.acceleration, airborne), safe.reason)
+
+
+def _no_command(kind: str, refusal: Refusal, yaw: float | None,
+                acceleration: Array | None = None, limited: str = '') -> Setpoint:
+    """Return a setpoint that replaces a refused command; level without an acceleration."""
+    return Setpoint(kind, str(refusal), np.zeros(3) if acceleration is None else acceleration,
+                    yaw, limited, refusal.cause)
 
 
 def _sane_offset(offset: ArrayLike) -> Array:
@@ -180,45 +158,48 @@ def _sane_offset(offset: ArrayLike) -> Array:
     return limit_norm(vector, SANE)
 
 
-def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-             link_age: float, mode_age: float, unplaced: str, relative: Relative,
-             place: Location, airborne: bool) -> str:
-    """Return why a command may not pass, or ''."""
-    if not link_age <= limits.link_timeout:  # written so that NaN fails
-        return 'link lost'
-    if not mode_age <= MODE_TIMEOUT:
-        return MODE_UNKNOWN
-    if command is not None and command.relative:
-        reason = _marker_refusal(limits, relative, place, airborne)
+def find_refusal(situation: Situation) -> Refusal | None:
+    """Return why the command of a situation may not pass, or None."""
+    limits, command = situation.limits, situation.command
+    if not situation.report.link_age <= limits.link_timeout:  # written so that NaN fails
+        return Refusal(Obstacle.LINK_LOST)
+    if not situation.report.mode_age <= MODE_TIMEOUT:
+        return Refusal(Obstacle.MODE_UNKNOWN)
+    if command is not None and command.command.relative:
+        obstacle = _marker_obstacle(situation)
+        refusal = None if obstacle is None else Refusal(obstacle)
     else:
-        reason = _odometry_refusal(known)
-    if reason or unplaced:
-        return reason or unplaced
+        refusal = _odometry_refusal(situation.known)
+    if refusal or situation.unplaced:
+        return refusal or situation.unplaced
     if command is None:
-        return 'no command'
-    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
-        return 'command not finite'
-    return '' if fresh(command_age, limits.planner_timeout) else 'command stale'
+        return Refusal(Obstacle.NO_COMMAND)
+    if finite_vector(command.command.acceleration) is None or (
+            not math.isfinite(command.command.yaw)):
+        return Refusal(Obstacle.COMMAND_INVALID)
+    stale = not fresh(situation.command_age, limits.planner_timeout)
+    return Refusal(Obstacle.COMMAND_STALE) if stale else None
 
 
-def _odometry_refusal(known: KnownMotion) -> str:
-    """Return why a command may not rest on the odometry, or ''."""
+def _odometry_refusal(known: KnownMotion) -> Refusal | None:
+    """Return why a command may not rest on the odometry, or None."""
     if known.velocity is not None:
-        return known.contradiction
+        return Refusal(known.contradiction) if known.contradiction else None
     if known.never:
-        return f'no velocity from {known.source}'
-    return f'velocity from {known.source} stale'
+        return Refusal(Obstacle.NO_VELOCITY, f'no velocity from {known.source}')
+    return Refusal(Obstacle.VELOCITY_STALE, f'velocity from {known.source} stale')
 
 
-def _marker_refusal(limits: GateLimits, relative: Relative, place: Location,
-                    airborne: bool) -> str:
-    """Return why a command may not rest on the marker alone, or ''."""
-    return first_reason(
-        (not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout),
-         'relative command not permitted'),
-        (not fresh(relative.marker_age, OLDEST_MARKER), 'marker lost'),
-        (place.height is None or not math.isfinite(place.height + place.climb_rate), 'no height'),
-        (not airborne, 'on the ground'))
+def _marker_obstacle(situation: Situation) -> Obstacle | None:
+    """Return why a command may not rest on the marker alone, or None."""
+    limits, relative, place = situation.limits, situation.relative, situation.place
+    if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
+        return Obstacle.NOT_RELATIVE
+    if not fresh(situation.source_age, OLDEST_MARKER):
+        return Obstacle.MARKER_LOST
+    if place.height is None or not math.isfinite(place.height + place.climb_rate):
+        return Obstacle.NO_HEIGHT
+    return None if situation.report.airborne else Obstacle.ON_GROUND
 
 
 def _relative(full: GateLimits, command: Command, offset: Array, place: Location) -> Setpoint:

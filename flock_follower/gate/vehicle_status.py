@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the gate knows of the vehicle: whether it is armed, and whether it obeys setpoints."""
+"""What the gate knows of the vehicle and of its autopilot."""
 
 from __future__ import annotations
 
@@ -26,3 +26,14 @@ class VehicleStatus(NamedTuple):
     mode: str
     offboard: bool
     """Whether the mode obeys our setpoints: OFFBOARD, GUIDED."""
+
+
+class AutopilotTraits(NamedTuple):
+    """What the autopilot is like, as far as the gate depends on it."""
+
+    hover_thrust: str = 'the hover thrust'
+    """Its parameter of the hover thrust."""
+    needs_wind_offset: bool = False
+    """Whether setpoints offset the wind, because the autopilot does not."""
+    fused: bool = False
+    """Whether its estimate rests on our odometry, so that it is no evidence."""

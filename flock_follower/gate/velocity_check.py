@@ -39,8 +39,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.gate.envelope import GateLimits
-from flock_follower.geometry import Array, wrap_angle
-from flock_follower.messages import FASTEST_OWN, FUTURE_TOLERANCE, POSITION_JUMP
+from flock_follower.gate.obstacle import Obstacle, Refusal
+from flock_follower.geometry import Array, wrap_angle, yaw_from_quaternion
+from flock_follower.messages import (
+    FASTEST_OWN,
+    FUTURE_TOLERANCE,
+    OdometryState,
+    POSITION_JUMP,
+    SANE,
+)
 from flock_follower.planner.limits import limit_norm
 from flock_follower.ranges import first_reason
 
@@ -54,8 +61,6 @@ USUAL_AGE: Final[float] = 0.05
 LATE_FACTOR: Final[float] = math.e
 ODOM: Final[str] = 'odom'
 AUTOPILOT: Final[str] = 'autopilot'
-YAWS_DISAGREE: Final[str] = 'yaws of odom and of the autopilot disagree'
-VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disagree'
 
 
 class Velocity(NamedTuple):
@@ -67,8 +72,28 @@ class Velocity(NamedTuple):
     """Increase of time constants by the age of the velocity, s."""
 
 
-class Motion(NamedTuple):
-    """The vehicle's motion by one source; an age is infinite before its first message."""
+class MotionReport(NamedTuple):
+    """The vehicle's motion in one message of a source."""
+
+    velocity: ArrayLike
+    """(3,), m/s."""
+    yaw: float = math.nan
+    """rad; NaN without one."""
+    position: ArrayLike | None = None
+    """(3,), m, in the frame of the source."""
+    std: float = 0.0
+    """Standard deviation of the position, m."""
+
+    @classmethod
+    def from_odometry(cls, state: OdometryState) -> MotionReport:
+        """Return the motion in a message of odometry."""
+        variance = float(np.trace(state.pose_covariance[:3, :3]))
+        return cls(state.velocity, yaw_from_quaternion(state.quaternion), state.position,
+                   math.sqrt(max(variance, 0.0)))
+
+
+class SourceMotion(NamedTuple):
+    """The newest motion by one source; an age is infinite before its first message."""
 
     velocity: ArrayLike = (0.0, 0.0, 0.0)
     """(3,), m/s."""
@@ -104,8 +129,8 @@ class KnownMotion(NamedTuple):
     """Whether the source has not sent any yet."""
     braking: Velocity | None
     """The velocity to brake with; None if none is fresh, or if two disagree."""
-    contradiction: str
-    """The contradiction between odom and the autopilot, or ''."""
+    contradiction: Obstacle | None
+    """The contradiction between odom and the autopilot, if any."""
     blind: bool
     """Whether every velocity has been invalid for too long, after a valid one."""
     turned: float | None
@@ -115,7 +140,7 @@ class KnownMotion(NamedTuple):
     fresh; else None."""
 
 
-def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
+def known_motion(limits: GateLimits, odom: SourceMotion, autopilot: SourceMotion, source: str,
                  disagreeing_for: float = -math.inf,
                  distrusted_for: float = -math.inf) -> KnownMotion:
     """
@@ -128,16 +153,17 @@ def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: st
     by_odom, by_autopilot = odom.fresh_velocity(limits), autopilot.fresh_velocity(limits)
     first, velocity, other = (odom, by_odom, by_autopilot) if source == ODOM else (
         autopilot, by_autopilot, by_odom)
-    braking, contradiction = velocity or other, ''
+    contradiction: Obstacle | None = None
+    braking = velocity or other
     yaw, own = odom.fresh_yaw(limits), autopilot.fresh_yaw(limits)
     turned = None if yaw is None or own is None else wrap_angle(yaw - own)
     if turned is not None and abs(turned) > limits.yaw_disagreement:
         # The frames are rotated against each other: braking would accelerate. The autopilot obeys
         # in its own frame.
-        braking, contradiction = by_autopilot or by_odom, YAWS_DISAGREE
+        braking, contradiction = by_autopilot or by_odom, Obstacle.YAWS_DISAGREE
     elif disagreeing_for >= 0.0:
         # One of them is wrong: braking on that one would speed the vehicle up.
-        braking, contradiction = None, VELOCITIES_DISAGREE
+        braking, contradiction = None, Obstacle.VELOCITIES_DISAGREE
     difference = None
     if source == ODOM and by_odom is not None and by_autopilot is not None:
         difference = by_odom.vector - by_autopilot.vector
@@ -243,7 +269,11 @@ SPACING: Final[float] = 0.1
 
 
 class Path:
-    """The positions (3,), m, of one source, without jumps; times are monotonic, s."""
+    """
+    The positions (3,), m, of one source, without jumps; times are monotonic, s.
+
+    Jumps are judged here by one rule for both sources: the autopilot's position counts none.
+    """
 
     def __init__(self) -> None:
         self.position: Array | None = None
@@ -325,6 +355,24 @@ class Source:
         self.std = 0.0
         """Standard deviation of the position, m."""
 
+    def take_velocity(self, velocity: Array, time: float) -> None:
+        """Take a velocity (3,), m/s, at a time, s."""
+        self.velocity, self.velocity_time = velocity, time
+
+    def take_position(self, position: ArrayLike | None, time: float, std: float,
+                      max_age: float) -> None:
+        """
+        Take a position (3,), m, at a time, s, with a standard deviation, m.
+
+        :param max_age: of the velocity that the position is compared with, s.
+        """
+        p = finite_vector(position)
+        if p is not None and np.all(np.abs(p) < SANE):
+            fresh = time - self.velocity_time <= max_age
+            self.position = p
+            self.path.take(p, self.velocity if fresh else None, time)
+            self.std = std if math.isfinite(std) else 0.0
+
     def take_yaw(self, yaw: float, time: float) -> None:
         """Take a yaw, rad, at a time, s; it replaces one of the same time."""
         newest = self.yaws[-1][0] if self.yaws else -math.inf
@@ -346,26 +394,32 @@ class Source:
         near = yaws[max(after - 1, 0):after + 1]
         return min(reversed(near), key=lambda known: abs(known[0] - time))[::-1]
 
+    def motion(self, now: float, at: float = math.inf) -> SourceMotion:
+        """Return the newest motion at ``now``, s, with the yaw nearest to a time, s."""
+        yaw, _ = self.yaw(at)
+        return SourceMotion(self.velocity, now - self.velocity_time, yaw, now - self.yaw()[1])
+
 
 def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
-              now: float) -> str:
+              now: float) -> Refusal | None:
     """
-    Return that the displacements of odometry and of another source differ, as text, or ''.
+    Return that the displacements of odometry and of another source differ, or None.
 
     :param autopilot: None if its estimate is not independent of odometry.
     :param turn: yaw of odom minus that of the autopilot, rad.
     :param height: heights by the barometer.
     """
-    reason = ''
+    refusal = None
     if autopilot is not None:
-        off = difference(odom.path, autopilot.path, -turn, now)[:2]
-        reason = _apart(off, math.hypot(odom.std, autopilot.std), 'autopilot')
-    off = difference(odom.path, height, 0.0, now)[2:]
-    return reason or _apart(off, math.hypot(odom.std, BAROMETER_STD), 'barometer')
+        level = difference(odom.path, autopilot.path, -turn, now)[:2]
+        refusal = _too_far(level, math.hypot(odom.std, autopilot.std), 'autopilot')
+    up = difference(odom.path, height, 0.0, now)[2:]
+    return refusal or _too_far(up, math.hypot(odom.std, BAROMETER_STD), 'barometer')
 
 
-def _apart(off: Array, std: float, other: str) -> str:
-    """Return that displacements differ by ``off``, m, by their deviation, m, as text, or ''."""
-    far = float(np.linalg.norm(off))
-    return '' if not far > max(TOLERANCE, 3.0 * std) else (
-        f'displacements of odom and of the {other} differ by {far:.1f} m in {WINDOW:g} s')
+def _too_far(error: Array, std: float, other: str) -> Refusal | None:
+    """Return that displacements differ by more than their deviation, both m, permits, or None."""
+    distance = float(np.linalg.norm(error))
+    return None if not distance > max(TOLERANCE, 3.0 * std) else Refusal(
+        Obstacle.DISPLACED, f'displacements of odom and of the {other} differ by '
+        f'{distance:.1f} m in {WINDOW:g} s')

@@ -27,13 +27,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.bridge_state import NO_AUTOPILOT
-from flock_follower.gate.flight_end import EndParams, FlightEnd, HOLD
-from flock_follower.gate.gate import AcceptedCommand, Gate
-from flock_follower.gate.permission import Cause, FELL_SILENT, Phase, STICK, UNKNOWN
+from flock_follower.bridge_state import LOST, NO_AUTOPILOT
+from flock_follower.gate.flight_end import EndParams, FlightEnd, Handover, HOLD
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.permission import Cause, Phase, STICK, Taker, UNKNOWN
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
-from flock_follower.gate.vehicle_status import VehicleStatus
-from flock_follower.gate.velocity_check import AUTOPILOT
+from flock_follower.gate.situation import AcceptedCommand
+from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink import commands, estimator_health
 from flock_follower.mavlink.commands import NOT_RECEIVED, Request
@@ -104,7 +105,7 @@ class Bridge:
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
         self.takeover = TakeoverWatch()
-        self._reported_cause: Cause | None = None  # to the ground station
+        self._reported_taker: Taker | None = None  # to the ground station
         self.sticks = StickWatch(self.end.params.stick_override)
         self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
@@ -115,7 +116,7 @@ class Bridge:
         """The request by which the bridge itself ended the flight last, if any."""
         self.ground_station = GroundStationReport()
         self._reports = report_to_gcs
-        gate.fused = forwarder is not None
+        gate.autopilot = gate.autopilot._replace(fused=forwarder is not None)
         self._wind_compensation = wind_compensation
         self._start = self._streaming_since = now
         self._last_sent = -math.inf
@@ -147,7 +148,7 @@ class Bridge:
             announced = f'{permission.phase.value}: {unreceived}'
         return first_reason(
             (self.telemetry.dialect is None, f'{NO_AUTOPILOT}: no HEARTBEAT yet'),
-            (not self.alive(now), f'{NO_AUTOPILOT}: lost, {announced} before'), (True, announced))
+            (not self.alive(now), f'{NO_AUTOPILOT}: {LOST}{announced} before'), (True, announced))
 
     def withheld(self) -> str:
         """Return why no setpoint may be sent, or ''."""
@@ -195,19 +196,20 @@ class Bridge:
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         if position is not None and position.time == now:
             gps = self.telemetry.gps
-            if refused := self.distrusted(now) or self.gate.update_velocity(
-                    AUTOPILOT, position.velocity, self._age(position, now), now,
-                    position=position.position, std=0.0 if gps is None else gps.accuracy):
+            report = MotionReport(position.velocity, position=position.position,
+                                  std=0.0 if gps is None else gps.accuracy)
+            if refused := self.distrusted(now) or self.gate.take_motion(
+                    AUTOPILOT, report, self._age(position, now), now):
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
         if attitude is not None and attitude.time == now:
             time = now - self._age(attitude, now)
-            self.gate.update_yaw(AUTOPILOT, yaw_from_quaternion(attitude.quaternion), time)
-            motion = self.gate.update_attitude(
+            self.gate.motion.take_yaw(AUTOPILOT, yaw_from_quaternion(attitude.quaternion), time)
+            motion = self.gate.take_attitude(
                 attitude.quaternion, attitude.angular_velocity, time, now)
             self.motion = None if motion is None else (motion, time)
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
         if altitude is not None and altitude.time == now and (
-                refused := self.gate.update_height(altitude.altitude, now, altitude.source)):
+                refused := self.gate.take_height(altitude.altitude, now, altitude.source)):
             self.link.ignored[f'{altitude.source} {refused}'] += 1
         if battery is not None and battery.time == now:
             self.end.take_battery(battery.remaining, now)
@@ -228,9 +230,10 @@ class Bridge:
         """Send the messages due at ``now``: a setpoint, HEARTBEAT, commands and requests."""
         status = self.telemetry.status
         if (dialect := self.telemetry.dialect) is not None:
-            self.gate.hover_thrust = dialect.hover_thrust
-            self.gate.compensates_wind = self._wind_compensation == 'always' or (
-                self._wind_compensation == 'auto' and not dialect.compensates_wind)
+            self.gate.autopilot = AutopilotTraits(
+                dialect.hover_thrust, self._wind_compensation == 'always' or (
+                    self._wind_compensation == 'auto' and not dialect.compensates_wind),
+                self.forwarder is not None)
         if status is not None:
             self._take_status(status, now)
             self._refer_height(status, now)
@@ -278,10 +281,9 @@ class Bridge:
 
     def _fell_silent(self, now: float) -> None:
         # A landing that has ended the permission is the end of the flight, not a loss.
-        reason = self.gate.permission.reason
-        if not reason.startswith(FELL_SILENT):
+        if self.gate.permission.cause is not Cause.SILENT:
             return
-        self.ground_station.take_handover(reason)
+        self.ground_station.take_handover(self.gate.permission.reason)
         if self._blind_action == 'land':
             self.blind_landing = self.requests.pending if self.requests.landing else (
                 self.requests.begin(commands.land, now))
@@ -304,20 +306,20 @@ class Bridge:
         handover = self.handover
         if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
-        why, action = self.end.reason(
-            self.gate.active_since, self.gate.command_time,
+        end = self.end.reason(
+            self.gate.active_since, self.gate.commands.received,
             self.gate.handover(now) if flies else '', now)
         if moved := self.sticks.moved and self.housekeeping.watches_sticks():
-            why, action = STICK.text, HOLD
+            end = Handover(STICK.text, cause=Cause.STICK)
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:
             held, *_ = handover.current.modes
-        ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
-                            held, status, now)
+        ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, end, held,
+                            status, now)
         if ask and not self.requests.stopping:
             stop = commands.position if moved else commands.hold
             self.handover = self.requests.begin(
-                stop if ask == HOLD else commands.land, now, why=self.end.why)
+                stop if ask == HOLD else commands.land, now, end=self.end.handover)
             self.ground_station.take_handover(self.end.why)
 
     def send_odometry(self, now: float) -> None:
@@ -372,20 +374,20 @@ class Bridge:
         if self.gate.permission.flies and not flew:
             self.sticks.begin(now)
         if self.gate.permission.phase is not Phase.TAKEN_OVER:
-            self._reported_cause = None
+            self._reported_taker = None
         self._attribute_takeover(now)
 
     def _attribute_takeover(self, now: float) -> None:
         """Find out who has taken over; report it once it is known, or after AFTER."""
         permission, dialect = self.gate.permission, self.telemetry.dialect
-        if permission.phase is not Phase.TAKEN_OVER or permission.cause in (PILOT, STICK) or (
+        if permission.phase is not Phase.TAKEN_OVER or permission.taker in (PILOT, STICK) or (
                 dialect is None):
             return
-        cause = self.takeover.cause(dialect, permission.received)
-        if now - permission.received > AFTER and cause != PILOT:
-            cause = permission.cause  # later evidence belongs to another failsafe
-        self.gate.permit(permission.attributed(cause, now))
-        settled = cause not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
-        if settled and cause != self._reported_cause:
-            self._reported_cause = cause
-            self.ground_station.take_handover(cause.text)
+        taker = self.takeover.taker(dialect, permission.received)
+        if now - permission.received > AFTER and taker != PILOT:
+            taker = permission.taker  # later evidence belongs to another failsafe
+        self.gate.permit(permission.attributed(taker, now))
+        settled = taker not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
+        if settled and taker != self._reported_taker:
+            self._reported_taker = taker
+            self.ground_station.take_handover(taker.text)

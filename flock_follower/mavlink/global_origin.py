@@ -72,7 +72,7 @@ class GlobalOrigin:
         self._began = math.inf  # of the first step, s
 
     def begin_again(self) -> None:
-        """Forget everything: the autopilot has rebooted, or is another one."""
+        """Forget everything, the origin too: the autopilot may have rebooted, or is another."""
         self.obstacle, self.awaited = '', self._without_gps
         self._time, self._began = -math.inf, math.inf
         self._requests = self._tries = 0

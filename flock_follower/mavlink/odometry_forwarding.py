@@ -129,7 +129,12 @@ class OdometryForwarder:
 
 
 def jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
-    """Return whether a pose differs from the one predicted from time ``then``, s, or time fell."""
+    """
+    Return whether a pose differs from the one predicted from time ``then``, s, or time fell.
+
+    A rule of its own: each jump that is counted resets the autopilot's estimate, so the small
+    steps by which ``derivation`` restarts its filter must not count.
+    """
     dt = now - then
     mean_velocity = 0.5 * (before.velocity + after.velocity)
     moved = after.position - before.position - mean_velocity * dt

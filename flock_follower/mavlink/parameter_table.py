@@ -23,7 +23,7 @@ from typing import Any
 from flock_follower.files import resource
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.flight_end import EndParams
-from flock_follower.gate.gate import VELOCITY_SOURCES
+from flock_follower.gate.motion_sources import VELOCITY_SOURCES
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
 from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.link import IDS

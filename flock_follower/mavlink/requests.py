@@ -28,7 +28,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.gate import envelope
-from flock_follower.gate.flight_end import FlightEnd
+from flock_follower.gate.flight_end import FlightEnd, Handover, NO_HANDOVER
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase
 from flock_follower.gate.vehicle_status import VehicleStatus
@@ -122,13 +122,13 @@ class Requests:
             self._housekeeping.request_reasons()
 
     def begin(self, make: Callable[[Dialect], Goal], now: float, obstacle: str = '',
-              why: str = '') -> Request:
+              end: Handover = NO_HANDOVER) -> Request:
         """
         Begin a request.
 
         :param make: returns the goal for an autopilot.
         :param obstacle: why it is refused at once, or ''.
-        :param why: why the bridge itself requests it; '' for a request by a person.
+        :param end: why the bridge itself requests it; for a request by a person empty.
         """
         gate, pending, superseded = self._gate, self.pending, None
         dialect = self._link.telemetry.dialect
@@ -142,10 +142,10 @@ class Requests:
              f'still waiting for {pending.goal.name if pending is not None else ""}'))
         if goal.ends_flight:
             # From here on setpoints only brake, even if the autopilot refuses.
-            gate.permit(gate.permission.ended(why or f'{goal.name} requested'))
+            gate.permit(gate.permission.ended(end.why or f'{goal.name} requested', end.cause))
             if pending is not None:
                 superseded = pending.refuse(f'superseded by {goal.name}').goal
-        request = Request(dialect or PX4, goal, now, superseded, own=bool(why))
+        request = Request(dialect or PX4, goal, now, superseded, own=bool(end.why))
         if obstacle:
             return request.refuse(obstacle)
         self.newest = request

@@ -139,7 +139,7 @@ class SetpointThread:
             # One of them may have brought odometry to forward.
             self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
         now = time.monotonic()
-        if self._bridge.gate.new_command:
+        if self._bridge.gate.commands.is_new:
             next_cycle = min(next_cycle, max(now, self._last_cycle + SHORTEST_PERIOD))
         if now < next_cycle:
             return next_cycle

@@ -29,11 +29,11 @@ import re
 from types import MappingProxyType
 from typing import Any, Final
 
-from flock_follower.gate.permission import Cause, UNKNOWN
+from flock_follower.gate.permission import Taker, UNKNOWN
 from flock_follower.mavlink.dialects import Dialect
 from flock_follower.mavlink.status_texts import event_number
 
-PILOT: Final[Cause] = Cause('the pilot took over', True)
+PILOT: Final[Taker] = Taker('the pilot took over', True)
 BATTERY, FENCE, STREAM = 'low battery', 'fence', 'no setpoint stream'
 TRANSMITTER, STATION, ESTIMATE = 'transmitter lost', 'ground station lost', 'no position estimate'
 UNNAMED: Final[str] = 'unknown cause'
@@ -68,9 +68,9 @@ _TEXTS: Final = tuple((re.compile(pattern, re.IGNORECASE), cause) for pattern, c
 _NO_CHANGE: Final = re.compile(r'continuing|cleared|recovered', re.IGNORECASE)
 
 
-def failsafe(why: str) -> Cause:
-    """Return the cause for a failsafe."""
-    return Cause(f'failsafe: {why}', False)
+def failsafe(why: str) -> Taker:
+    """Return a failsafe as the one who took over."""
+    return Taker(f'failsafe: {why}', False)
 
 
 class TakeoverWatch:
@@ -107,7 +107,7 @@ class TakeoverWatch:
         elif number in _CHECKS:
             self._checks[_CHECKS[number]] = now
 
-    def cause(self, dialect: Dialect, left: float) -> Cause:
+    def taker(self, dialect: Dialect, left: float) -> Taker:
         """Return who left the mode of setpoints at a time, s, by the evidence until now."""
         (mode, mode_time), (chosen, chosen_time) = self._mode, self._chosen
         if chosen_time >= left:

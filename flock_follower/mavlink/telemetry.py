@@ -280,9 +280,8 @@ class Telemetry:
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
 
     def forget(self) -> None:
-        """Drop origin, home and clock of an autopilot that has rebooted or was replaced."""
-        for kind in ('GPS_GLOBAL_ORIGIN', 'HOME_POSITION'):
-            self.newest.pop(kind, None)
+        """Drop home and clock of an autopilot that rebooted or was replaced; not the origin."""
+        self.newest.pop('HOME_POSITION', None)
         self._boot_time_ms, self._fallen = 0, False
 
     def _notice_reboot(self, stamp: int) -> None:

@@ -55,8 +55,9 @@ from flock_follower.nodes.support.image_middleware import (
 )
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.output import never_block_output
+from flock_follower.nodes.support.process import run, spin
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import FlockNode, LONGEST_WAIT, run, spin, Waiting
+from flock_follower.nodes.support.runtime import FlockNode, LONGEST_WAIT, Waiting
 from flock_follower.parameters.cameras import cameras
 from flock_follower.parameters.files import FLOWN
 from flock_follower.perception.images import decode_image, encode_jpeg

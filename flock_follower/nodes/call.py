@@ -43,7 +43,7 @@ from flock_follower.mavlink.commands import (
     TAKEOFF_DELAY,
 )
 from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
-from flock_follower.nodes.support.runtime import run
+from flock_follower.nodes.support.process import run
 
 POLL_PERIOD = 0.1  # s between looks for the service
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine

@@ -28,7 +28,16 @@ from ipaddress import ip_address
 import math
 from typing import Final
 
-from flock_follower.bridge_state import ACTIVE, NO_AUTOPILOT, READY
+from flock_follower.bridge_state import (
+    ACTIVE,
+    ARMED,
+    BridgeState,
+    FLYING,
+    NO_AUTOPILOT,
+    parse,
+    read_flag,
+    READY,
+)
 from flock_follower.mavlink.connection import parse_connection
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
@@ -74,6 +83,10 @@ class Reports:
         """Return a value of a node's diagnostics, or ''."""
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
 
+    def flag(self, node: str, key: str) -> bool | None:
+        """Return a value that is true or false, None if it is unknown."""
+        return read_flag(self.nodes[node][1], key) if node in self.nodes else None
+
     def missing(self, since: float) -> list[str]:
         """Return the nodes that have not reported after a time, s."""
         return [node for node in NODES
@@ -82,20 +95,20 @@ class Reports:
     @property
     def vehicle_known(self) -> bool:
         """Return whether the bridge, and its diagnostics of up to 1 s later, know the vehicle."""
-        return not self.bridge.startswith(NO_AUTOPILOT) and all(
-            self.value('mavlink_bridge', key) for key in ('armed', 'flying'))
+        return parse(self.bridge).name != NO_AUTOPILOT and None not in (
+            self.flag('mavlink_bridge', ARMED), self.flag('mavlink_bridge', FLYING))
 
     @property
     def streams(self) -> bool:
         """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
-        return self.bridge.removeprefix(f'{NO_AUTOPILOT}: lost, ').startswith((READY, ACTIVE))
+        return parse(self.bridge).last_known.name in (READY, ACTIVE)
 
     def due(self) -> str:
         """Return the first step whose result is not reported, '' while the vehicle follows."""
-        reached = {'arm': self.value('mavlink_bridge', 'armed') == 'True',
-                   'takeoff': self.value('mavlink_bridge', 'flying') == 'True',
-                   'offboard': self.bridge == ACTIVE,
-                   'engage': self.value('planner', 'engaged') == 'True'}
+        reached = {'arm': self.flag('mavlink_bridge', ARMED),
+                   'takeoff': self.flag('mavlink_bridge', FLYING),
+                   'offboard': parse(self.bridge) == BridgeState(ACTIVE),
+                   'engage': self.flag('planner', 'engaged')}
         return next((step for step, done in reached.items() if not done), '')
 
     def line(self, now: float) -> str:
@@ -145,7 +158,7 @@ class Flight:
                    if self._ready or node == 'mavlink_bridge']
         if self._landing:
             if 'mavlink_bridge' not in missing and (
-                    reports.value('mavlink_bridge', 'armed') == 'False'):
+                    reports.flag('mavlink_bridge', ARMED) is False):
                 self.lines.append('landed and disarmed')
                 self.code = 0
         elif missing:
@@ -171,7 +184,7 @@ class Flight:
         """Take a key: the key of the step that is due confirms it; l lands at any step."""
         if self._ending is not None:
             return []
-        airborne = reports.value('mavlink_bridge', 'flying') != 'False'
+        airborne = reports.flag('mavlink_bridge', FLYING) is not False
         if key == 'l' and 'land' not in self._pending and (airborne or 'takeoff' in self._pending):
             self._landing = True
             return self._request('disengage', 'land')
@@ -213,7 +226,7 @@ class Flight:
         if (reports.streams and not self._landing) or climbs:
             self.lines.append('brakes and hands over')
             return self._request('disengage', 'hand over')
-        if reports.value('planner', 'engaged') == 'True':
+        if reports.flag('planner', 'engaged'):
             return self._request('disengage')
         self.code = code
         return []

@@ -36,7 +36,8 @@ from flock_follower.messages import from_odometry, from_state, OdometryState
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import Spec, specs_of
 

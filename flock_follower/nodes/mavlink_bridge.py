@@ -36,13 +36,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-import math
 import os
 import sys
 import time
 from typing import Any
 
-import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from sensor_msgs.msg import Range
@@ -54,8 +52,7 @@ from flock_follower.command_messages import from_trajectory
 from flock_follower.gate.flight_end import CommandSources, EndParams
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase
-from flock_follower.gate.velocity_check import ODOM
-from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.gate.velocity_check import MotionReport, ODOM
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.link import Link, Signing
@@ -77,8 +74,9 @@ from flock_follower.nodes.support.even_clock import EvenClock
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
 from flock_follower.nodes.support.output import never_block_output
+from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.publisher_thread import PublisherThread
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import filled
 
 # Not only the newest: otherwise a second commanding node would not be detected.
@@ -277,10 +275,8 @@ class MavlinkBridge(FlockNode):
     def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
         """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
         for state, age, now in taken:
-            refusals = [self._bridge.gate.update_velocity(
-                ODOM, state.velocity, age, now, yaw=yaw_from_quaternion(state.quaternion),
-                position=state.position,
-                std=math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
+            refusals = [self._bridge.gate.take_motion(
+                ODOM, MotionReport.from_odometry(state), age, now)]
             if self._settings.values['forward_odometry']:
                 refusals.append(self._bridge.forward(state, now - age, now))
             for refused in filter(None, refusals):

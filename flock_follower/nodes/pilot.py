@@ -55,8 +55,8 @@ from flock_follower.nodes.flight_steps import (
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
 from flock_follower.nodes.support.output import never_block_output
+from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import run
 from flock_follower.signals import ending
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers

@@ -61,8 +61,9 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WAR
 from flock_follower.nodes.support.even_clock import EvenClock
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.remote_parameters import WatchedParameters
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.cameras import cameras
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State

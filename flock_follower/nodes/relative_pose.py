@@ -16,9 +16,12 @@
 The perception node: images and own odometry in, the neighbors' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
-calibration of each of several cameras (parameter ``cameras``); publishes
+calibration of each of several cameras (parameter ``cameras``), or the poses of other detectors
+(``pose_topic``, ``tf_frame`` and ``frames_topic`` of the neighbors' file); publishes
 one ``neighbors`` and one ``neighbors/acceleration`` message per neighbor measured in an image,
-stamped like the image, the same as NAME/duplicate for another object with the marker of NAME,
+stamped like the image; the measured pose of NAME in the camera's optical frame as
+``neighbors/NAME/pose``; its pose in the frame of ``odom`` on ``/tf`` if tf2_msgs is installed; the
+same as NAME/duplicate for another object with the marker of NAME,
 ``neighbors/frames`` for every image processed, with or without a neighbor,
 and, while ``~/debug_image`` has a subscriber, every image with the measurements drawn in (of
 several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
@@ -27,13 +30,15 @@ several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Callable
 from functools import partial
 import sys
 import time
 from typing import Any
 
-from geometry_msgs.msg import AccelWithCovarianceStamped
+from geometry_msgs.msg import AccelWithCovarianceStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
@@ -47,10 +52,12 @@ from flock_follower.messages import (
     OdometryState,
     read_stamp,
 )
-from flock_follower.nodes.support.conversions import make
+from flock_follower.nodes.support.conversions import make, message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.pose_inputs import PoseInputs
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.perception.camera import CameraModel, marked_rectified
 from flock_follower.perception.images import compute_in_one_thread
@@ -59,8 +66,11 @@ from flock_follower.perception.overlay import annotate
 from flock_follower.perception.parameter_table import RELATIVE_POSE as SPECS
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
+from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
+from flock_follower.perception.tracker import Sighting
+from flock_follower.pose_messages import child_frame, pose_topic, TRANSFORMS, transforms
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at if no odometry comes
@@ -76,12 +86,13 @@ class _Camera:
         self.dropping_since: float | None = None
         self._last_rejection = ''
         self._node = node
-        images = node.subscribe(
-            CompressedImage if transport == 'compressed' else Image, values.images(transport),
-            partial(node.take_image, self), best_effort(), largest=None)
+        self._images = node.resolve_topic_name(values.images(transport))
+        if node.marked:
+            node.subscribe(
+                CompressedImage if transport == 'compressed' else Image, values.images(transport),
+                partial(node.take_image, self), best_effort(), largest=None)
         node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
-                       best_effort())
-        self._images = images.topic_name
+                       best_effort(), required=node.marked)
         self.debug_images = node.create_publisher(
             Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
             best_effort())
@@ -122,16 +133,27 @@ class RelativePose(FlockNode):
         self._duplicates: dict[str, tuple[float, Estimate]] = {}
         self._misprints: dict[str, tuple[float, Fault]] = {}
 
+        self.marked = any(n.markers for n in self._tracker.config.neighbors)
+        """Whether a neighbor has a marker: else no image is needed."""
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
-        self._own = OwnOdometry(self, self._values, self._use_odometry, awaited=self._awaited)
-        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
-                                      required=False, awaited=self._awaited)
+        self._polls: list[Callable[[], None]] = []
+        """Take the odometry that waits, and before it the motion that is flown on without it."""
+        if not self._tracker.alone:
+            self._own = OwnOdometry(
+                self, self._values, self._use_odometry, awaited=self._awaited)
+            self._polls = [
+                self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
+                          required=False, awaited=self._awaited), self._own.poll]
         self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
         self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', QoSProfile(depth=10))
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', QoSProfile(depth=10))
+        self._poses = {pose_topic(n.name): self.create_publisher(
+            PoseWithCovarianceStamped, pose_topic(n.name), QoSProfile(depth=10))
+            for n in self._tracker.config.neighbors}
+        self._transforms = self._transform_publisher() if self._values['publish_tf'] else None
         self._frames = self.create_publisher(Header, 'neighbors/frames', QoSProfile(depth=1))
         self.diagnostics.checks += [self._sight_problem, self._duplicate_problem]
         self.diagnostics.sources.append(self._learned)
@@ -139,6 +161,20 @@ class RelativePose(FlockNode):
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
             clock=STEADY)
         self._overdue.cancel()
+        own_frames = frozenset(child_frame(n.name, self.get_namespace())
+                               for n in self._tracker.config.neighbors)
+        self._sources = PoseInputs(
+            self, self._perceiver, self._use_sources,
+            own_frames if self._transforms is not None else frozenset()) if (
+                self._perceiver.sources.sources) else None
+
+    def _transform_publisher(self) -> Publisher | None:
+        """Return the publisher of /tf; None if tf2_msgs is not installed, as in PyPI's runtime."""
+        try:
+            return self.create_publisher(message_class(TRANSFORMS), '/tf', QoSProfile(depth=100))
+        except ValueError:
+            self.get_logger().info('tf2_msgs is not installed: nothing is published on /tf')
+            return None
 
     def take_camera_info(self, camera: _Camera, message: CameraInfo) -> None:
         """Take the calibration of a camera."""
@@ -155,13 +191,14 @@ class RelativePose(FlockNode):
         return self._perceiver.model(name)
 
     def _awaited(self) -> bool:
-        """Return whether an image, or a range, waits for odometry."""
-        return self._perceiver.overdue is not None or self._tracker.ranging.waiting
+        """Return whether an image, a range or a pose waits for odometry."""
+        return self._perceiver.overdue is not None or (
+            self._tracker.ranging.waiting or self._perceiver.sources.has_waiting)
 
     def poll_odom(self) -> None:
-        """Take the odometry that waits, and before it the motion that is flown on without it."""
-        self._poll_motion()
-        self._own.poll()
+        """Take the own motion that waits."""
+        for poll in self._polls:
+            poll()
 
     def _take_motion(self, message: Odometry, arrival: int) -> None:
         self._use_odometry(from_odometry(message), arrival)
@@ -203,22 +240,62 @@ class RelativePose(FlockNode):
         try:
             while (seen := self._perceiver.process(
                     time.monotonic(), time.monotonic, self._shown)) is not None:
-                image, sighting = seen.image, seen.sighting
-                for name, estimate in (*sighting.estimates.items(),
-                                       *sighting.duplicates.items()):
-                    state, acceleration = self._perceiver.messages(
-                        make, image.stamp_ns, name, estimate)
-                    self._accelerations.publish(acceleration)  # first: the state needs it
-                    self._neighbors.publish(state)
+                self._publish(seen.image.stamp_ns, seen.sighting)
+                for topic, pose in self._perceiver.poses(make, seen):
+                    self._poses[topic].publish(pose)
                 if seen.usable:  # after the estimates: the planner has them when it receives this
                     self._frames.publish(Header(
-                        stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
+                        stamp=seen.image.message.header.stamp, frame_id=self._perceiver.frame))
                 self._count(seen)
         except Exception as error:  # counts as a dropped image; the next one may do better
             self.diagnostics.internal_error('on an image', error)
         self._use_ranges()
+        self._use_sources()
         if self._perceiver.overdue is not None:
             self._overdue.reset()
+
+    def _publish(self, stamp: int, sighting: Sighting) -> None:
+        """Publish the states of the neighbors measured at a stamp, ns."""
+        states = []
+        for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
+            state, acceleration = self._perceiver.messages(make, stamp, name, estimate)
+            self._accelerations.publish(acceleration)  # first: the state needs it
+            self._neighbors.publish(state)
+            states += [state] if name in sighting.estimates else []
+        if states and self._transforms is not None:
+            self._transforms.publish(transforms(make, states, self.get_namespace()))
+
+    def _use_sources(self) -> None:
+        """Use the poses of other detectors that need not wait any longer."""
+        if self._sources is None:
+            return
+        now = time.monotonic()
+        for outcome in self._perceiver.sources.due(now):
+            if isinstance(outcome, int):
+                self._frames.publish(Header(
+                    stamp=nanoseconds_to_stamp(outcome), frame_id=self._perceiver.frame))
+                self._processed = now
+                self.diagnostics.rate('processed').tick(now)
+            elif isinstance(outcome, Sourced):
+                self._publish(outcome.stamp, outcome.sighting)
+                self._sources.judge(outcome)
+                for rejection in outcome.sighting.rejections:
+                    self.diagnostics.reject(*rejection)
+                self._see(outcome.sighting, outcome.stamp, now)
+            else:
+                self.diagnostics.reject(*outcome)
+        if self._perceiver.sources.has_waiting:
+            self._overdue.reset()
+
+    def _see(self, sighting: Sighting, stamp: int, now: float) -> None:
+        """Update rate and latency of the neighbors measured at a stamp, ns."""
+        age = self.get_clock().now().nanoseconds - stamp
+        for name in sighting.estimates:
+            self.diagnostics.rate(name).tick(now)
+            if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
+                self.diagnostics.latency('stamp_to_estimate').append(age / NANOSECONDS)
+        self._seen.update(dict.fromkeys(sighting.estimates, now))
+        self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
 
     def _shown(self, name: str) -> bool:
         return self._cameras[name].debug_images.get_subscription_count() > 0
@@ -227,20 +304,14 @@ class RelativePose(FlockNode):
         """Update the diagnostics with the result of an image; draw it if a viewer subscribes."""
         image, sighting, camera = seen.image, seen.sighting, self._cameras[seen.image.camera]
         now = time.monotonic()
-        age = self.get_clock().now().nanoseconds - image.stamp_ns
         for reason, detail in sighting.rejections:
             camera.reject(reason, detail)
-        for name in sighting.estimates:
-            self.diagnostics.rate(name).tick(now)
-            if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
-                self.diagnostics.latency('stamp_to_estimate').append(age / NANOSECONDS)
+        self._see(sighting, image.stamp_ns, now)
         self.diagnostics.latency('processing').append(seen.decoding + seen.perception)
         if seen.usable:
             self._processed, camera.dropping_since = now, None
             self.diagnostics.rate('processed').tick(now)
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
-        self._seen.update(dict.fromkeys(sighting.estimates, now))
-        self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
         self._misprints.update({name: (now, f) for name, f in sighting.misprints.items()})
         if seen.pixels is not None and image.model is not None and self._shown(camera.name):
             drawn = annotate(seen.pixels, image.model, sighting, self._tracker.config)
@@ -266,7 +337,9 @@ class RelativePose(FlockNode):
         if now - self._processed > UNSEEN_TIMEOUT:
             return None  # nothing can be seen without images
         unseen = [f'{n.name} (marker {", ".join(str(m.marker_id) for m in n.markers)} of '
-                  f'{self._tracker.config.dictionary})' for n in self._tracker.config.neighbors
+                  f'{self._tracker.config.dictionary})' if n.source is None else
+                  f'{n.name} (poses of {n.source.topic or n.source.tf_frame})'
+                  for n in self._tracker.config.neighbors
                   if now - self._seen[n.name] > UNSEEN_TIMEOUT]
         for name, (found, fault) in self._misprints.items():
             if now - found < UNSEEN_TIMEOUT < now - self._seen[name]:

@@ -44,7 +44,8 @@ from flock_follower.bags.live_line import bar, LiveLine
 from flock_follower.bags.schedule import Gaps, NS_PER_S, section, Timeline
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import percentiles
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import sys
 
 from flock_follower.nodes.flock import SharingNode, SPECS
-from flock_follower.nodes.support.runtime import run
+from flock_follower.nodes.support.process import run
 
 __all__ = ['SPECS', 'main']
 

@@ -22,7 +22,6 @@ the planner's band about it. No other node waits for it.
 
 from __future__ import annotations
 
-import math
 import sys
 from typing import Any
 
@@ -30,7 +29,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 import numpy as np
-from numpy.typing import ArrayLike
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import ColorRGBA
@@ -38,7 +36,6 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
 from flock_follower.command_messages import Command, from_trajectory
-from flock_follower.geometry import Array, IDENTITY_QUATERNION, matrix_to_quaternion
 from flock_follower.messages import (
     from_odometry,
     NANOSECONDS,
@@ -48,38 +45,17 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import Spec
-from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
+from flock_follower.view.scene import ARROW, BOX, COLORS, draw, ELLIPSOID, LINE, Shape, TEXT
 
 SPECS: list[Spec] = []
 PERIOD = 0.1  # s between two drawings
 LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
 LARGEST = 65536  # bytes of a message on /diagnostics
-
-DEGENERATE = 1e-3  # m: the shortest length drawn, viewers refuse sizes of zero
-DEVIATIONS = 2.0  # of the ellipsoids
-VELOCITY_TIME = 1.0  # s: an arrow of velocity ends where it leads in this time
-ACCELERATION_SCALE = 0.5  # m of arrow per m/s^2
-UNSEEN = 0.25  # s without an image of it after which a neighbor is drawn in gray
-FORGOTTEN = 10.0  # s after which it is drawn no more
-SILENT = 0.5  # s after which a command is drawn no more
-ABOVE = np.array([0.0, 0.0, 0.3])  # m: the place of a label
-BODY_SIZE = (0.35, 0.35, 0.1)  # m
-TEXT_SIZE = (0.0, 0.0, 0.15)  # m: the height
-ARROW_SIZE, LINE_SIZE = (0.04, 0.08, 0.1), (0.02, 0.0, 0.0)  # m: widths; length of the head
-#: A level circle of radius 1 m, (49, 3).
-RING = np.array([[math.cos(a), math.sin(a), 0.0] for a in np.linspace(0.0, math.tau, 49)])
-
-Color = tuple[float, float, float, float]
-"""Red, green, blue and opacity, each in [0, 1]."""
-
-SEEN, GRAY, ELLIPSOID = (0.2, 0.5, 1.0, 0.9), (0.7, 0.7, 0.7, 0.9), (0.2, 0.5, 1.0, 0.25)
-EDGE, INNER, OUTER = (1.0, 1.0, 1.0, 0.6), (0.95, 0.3, 0.2, 0.7), (0.2, 0.8, 0.9, 0.7)
-COMMAND, GUARDED = (0.3, 0.9, 0.3, 1.0), (1.0, 0.55, 0.0, 1.0)
-STATES = {'TRACK': (0.3, 0.9, 0.3, 0.9), 'COAST': (0.95, 0.85, 0.2, 0.9),
-          'SEARCH': (1.0, 0.55, 0.0, 0.9), 'HOLD': (1.0, 0.3, 0.2, 0.9),
-          'RELATIVE': (0.8, 0.3, 0.9, 0.9)}
+KINDS = {BOX: Marker.CUBE, ARROW: Marker.ARROW, LINE: Marker.LINE_STRIP,
+         ELLIPSOID: Marker.SPHERE, TEXT: Marker.TEXT_VIEW_FACING}
 
 
 class Visualizer(FlockNode):
@@ -132,91 +108,27 @@ class Visualizer(FlockNode):
         for poll in self._polls:
             poll()
         now = self.get_clock().now()
-        drawn: list[Marker] = []
-        for state in self._neighbors.values():
-            drawn += self._neighbor(state, now.nanoseconds)
-        if self._own is not None:
-            drawn += self._follower(self._own, now.nanoseconds)
+        command = None if self._command is None else (
+            self._command, self._command.ages(now.nanoseconds)[0])
+        drawn = [to_marker(shape) for shape in draw(self._own, [
+            (state, (now.nanoseconds - state.stamp) / NANOSECONDS)
+            for state in self._neighbors.values()], command, self._report)]
         for marker in drawn:
             marker.header.frame_id, marker.header.stamp = self._frame, now.to_msg()
         self._markers.publish(MarkerArray(markers=drawn))
 
-    def _guarded(self) -> list[str]:
-        """Return the guard's reasons among the limits of the planner's command."""
-        return [reason for reason in REASONS if reason in self._report.get('limits', '')]
 
-    def _neighbor(self, state: OdometryState, now: int) -> list[Marker]:
-        """Return a neighbor, its velocity, ellipsoid, edge of the graph, and band."""
-        name, at, velocity = state.child, state.position, VELOCITY_TIME * state.velocity
-        age = (now - state.stamp) / NANOSECONDS
-        if age > FORGOTTEN:
-            return []
-        color, label = (SEEN, name) if age <= UNSEEN else (
-            GRAY, f'{name}, not seen for {age:.1f} s')
-        drawn = [shape(name, Marker.CUBE, color, BODY_SIZE, at, state.quaternion),
-                 shape(f'{name} name', Marker.TEXT_VIEW_FACING, color, TEXT_SIZE, at + ABOVE,
-                       text=label)]
-        if np.linalg.norm(velocity) > DEGENERATE:
-            drawn.append(shape(f'{name} velocity', Marker.ARROW, color, ARROW_SIZE,
-                               points=[at, at + velocity]))
-        if np.all(np.isfinite(state.pose_covariance[:3, :3])):
-            drawn.append(ellipsoid(f'{name} covariance', at, state.pose_covariance[:3, :3]))
-        if name not in self._report.get('edges', '').split(', '):
-            return drawn
-        if self._own is not None:
-            drawn.append(shape(f'{name} edge', Marker.LINE_STRIP, EDGE, LINE_SIZE,
-                               points=[self._own.position, at]))
-        return drawn + [
-            shape(f'{name} {edge}', Marker.LINE_STRIP, color,
-                  (0.05 if reason in self._guarded() else 0.015, 0.0, 0.0),
-                  points=at + float(self._report[edge]) * RING)
-            for edge, color, reason in (('nearest_m', INNER, SEPARATION),
-                                        ('farthest_m', OUTER, COHESION))]
-
-    def _follower(self, own: OdometryState, now: int) -> list[Marker]:
-        """Return the follower with its state and its command."""
-        guarded, state = self._guarded(), self._report.get('state', 'no planner')
-        color, at, command = STATES.get(state, GRAY), own.position, self._command
-        label = [state, *(f'guard: {reason}' for reason in guarded)]
-        if state != 'TRACK':
-            label.append(self._report.get('reason', ''))
-        drawn = [shape('follower', Marker.CUBE, color, BODY_SIZE, at, own.quaternion),
-                 shape('state', Marker.TEXT_VIEW_FACING, color, TEXT_SIZE, at + ABOVE,
-                       text='\n'.join(filter(None, label)))]
-        if command is not None and command.ages(now)[0] <= SILENT:
-            drawn.append(shape(
-                'command', Marker.ARROW, GUARDED if guarded else COMMAND, ARROW_SIZE,
-                points=[at, at + ACCELERATION_SCALE * np.asarray(command.acceleration, float)]))
-        return drawn
-
-
-def ellipsoid(name: str, center: Array, covariance: Array) -> Marker:
-    """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``DEVIATIONS`` sigma."""
-    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
-        axes[:, 0] = -axes[:, 0]
-    size = np.maximum(2.0 * DEVIATIONS * np.sqrt(np.maximum(variances, 0.0)), DEGENERATE)
-    return shape(name, Marker.SPHERE, ELLIPSOID, size, center, matrix_to_quaternion(axes))
-
-
-def shape(name: str, kind: int, color: Color, size: ArrayLike, position: ArrayLike = (0, 0, 0),
-          quaternion: Array = IDENTITY_QUATERNION, points: ArrayLike = (),
-          text: str = '') -> Marker:
-    """
-    Return a marker; its name is the namespace, so that each can be hidden.
-
-    :param size: (3,), m; of lines the first is the width, of text the last the height.
-    :param points: of lines and arrows (n, 3), m.
-    """
-    red, green, blue, opacity = color
-    places = np.asarray(points, float).tolist()
-    marker = Marker(ns=name, type=kind, action=Marker.ADD, text=text,
+def to_marker(shape: Shape) -> Marker:
+    """Return the marker of a shape; its name is the namespace, so that each can be hidden."""
+    red, green, blue, opacity = COLORS[shape.paint]
+    marker = Marker(ns=shape.name, type=KINDS[shape.kind], action=Marker.ADD, text=shape.text,
                     lifetime=Duration(seconds=LIFETIME).to_msg(),
                     color=ColorRGBA(r=red, g=green, b=blue, a=opacity),
-                    points=[Point(x=x, y=y, z=z) for x, y, z in places])
-    set_vector(marker.pose.position, position)
-    set_quaternion(marker.pose.orientation, quaternion)
-    set_vector(marker.scale, size)
+                    points=[Point(x=x, y=y, z=z)
+                            for x, y, z in np.asarray(shape.points, float).tolist()])
+    set_vector(marker.pose.position, shape.position)
+    set_quaternion(marker.pose.orientation, shape.quaternion)
+    set_vector(marker.scale, shape.size)
     return marker
 
 

@@ -185,7 +185,7 @@ class OdometryBuffer:
         Between two samples velocities are linear, and position and attitude go along with them;
         past the newest, its velocities carry on for at most ``MAX_EXTRAPOLATION``.
         """
-        after = self._reaching(stamp, extrapolate)
+        after = self._find_sample(stamp, extrapolate)
         if isinstance(after, Missing):
             return after
         if after == len(self):
@@ -220,14 +220,14 @@ class OdometryBuffer:
 
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
         """Return why :meth:`at` would give no state, or None."""
-        after = self._reaching(stamp, extrapolate)
+        after = self._find_sample(stamp, extrapolate)
         return after if isinstance(after, Missing) else None
 
-    def _reaching(self, stamp: float, extrapolate: bool) -> int | Missing:
+    def _find_sample(self, stamp: float, extrapolate: bool) -> int | Missing:
         """Return the index of the first sample at or after a stamp; the end if there is none."""
         if not len(self):
             return Missing.EMPTY
-        after = self._after(stamp, 'left')
+        after = self._index_after(stamp, 'left')
         if after == len(self):
             ahead = stamp - float(self._rows[-1, 0])
             return after if extrapolate and ahead <= self.MAX_EXTRAPOLATION else (
@@ -239,7 +239,7 @@ class OdometryBuffer:
         wide = self._rows[after, 0] - self._rows[after - 1, 0] > self.MAX_GAP
         return Missing.GAP if wide else after
 
-    def _after(self, stamp: float, side: Literal['left', 'right']) -> int:
+    def _index_after(self, stamp: float, side: Literal['left', 'right']) -> int:
         return int(self._rows[:, 0].searchsorted(stamp, side))
 
     def steadied(self, state: OdometrySample) -> OdometrySample:
@@ -249,8 +249,8 @@ class OdometryBuffer:
         That is done only if the angular velocities take one attitude to the next: see
         :meth:`_agree`. Attitudes that are off by more than their noise do not count.
         """
-        end = self._after(state.stamp, 'right')
-        first = max(self._after(state.stamp - self.STEADY, 'left'), end - self.AVERAGED)
+        end = self._index_after(state.stamp, 'right')
+        first = max(self._index_after(state.stamp - self.STEADY, 'left'), end - self.AVERAGED)
         if end - first < 3:
             return state
         recent = self._rows[first:end][::-1]

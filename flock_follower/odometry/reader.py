@@ -277,12 +277,12 @@ class OdometrySource:
 
     def _covariances(self, message: Any, rotation: Array, lever: Array) -> tuple[Array, Array]:
         """Return the covariances (6, 6) of pose and twist as messages have them, of base_link."""
-        pose = self._known('pose', message.pose.covariance, self._std[:2])
+        pose = self._complete_covariance('pose', message.pose.covariance, self._std[:2])
         if self._levers:
             moved = np.eye(6)
             moved[:3, 3:] = -skew(lever)
             pose = moved.dot(pose).dot(moved.T)
-        twist = self._known('twist', message.twist.covariance, self._std[2:])
+        twist = self._complete_covariance('twist', message.twist.covariance, self._std[2:])
         if self._reading == ODOM or not self._is_base:
             to_base = self._R_child_base.T
             turn = np.zeros((6, 6))
@@ -302,7 +302,7 @@ class OdometrySource:
                 twist[:3, :3] += share * (in_base[:, None] * in_base)
         return pose, twist
 
-    def _known(self, field: str, covariance: Any, variances: Array) -> Array:
+    def _complete_covariance(self, field: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) if a part is missing."""
         numbers = np.asarray(covariance, dtype=float)
         given = numbers.tobytes()
@@ -342,10 +342,10 @@ def read_odometry(data: bytes) -> Any:
     try:
         seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, _ALIGNMENT_START)
         frame = str(data[_ALIGNMENT_START + 12:_ALIGNMENT_START + 11 + length], 'utf-8')
-        at = _aligned(_ALIGNMENT_START + 12 + length, 4)
+        at = _align(_ALIGNMENT_START + 12 + length, 4)
         length, = struct.unpack_from(f'{order}I', data, at)
         child = str(data[at + 4:at + 3 + length], 'utf-8')
-        at = _aligned(at + 4 + length, 8)
+        at = _align(at + 4 + length, 8)
         # Position and attitude, velocity and angular velocity; a covariance follows either.
         n = struct.unpack_from(f'{order}7d288x6d288x', data, at)
     except (struct.error, UnicodeDecodeError) as error:
@@ -361,7 +361,7 @@ def read_odometry(data: bytes) -> Any:
                             angular=new(x=n[10], y=n[11], z=n[12])), covariance=of_twist))
 
 
-def _aligned(at: int, size: int) -> int:
+def _align(at: int, size: int) -> int:
     return at + (_ALIGNMENT_START - at) % size
 
 

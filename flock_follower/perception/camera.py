@@ -133,6 +133,19 @@ class CameraModel:
             raise ValueError('P = None: a rectified image needs the projection matrix P')
         return cls(_reshaped('P', P, (3, 4))[:, :3], np.zeros(5), 'plumb_bob', width, height)
 
+    @classmethod
+    def from_info(cls, info: Any, rectified: bool = False) -> CameraModel:
+        """
+        Return the camera of a ``CameraInfo`` message, of its region of interest and binning.
+
+        :raises ValueError: naming the fault of the calibration.
+        """
+        return cls.from_calibration(
+            info.k, info.d, info.distortion_model, info.width, info.height, info.p,
+            rectified=rectified).scaled(
+                info.roi.x_offset, info.roi.y_offset, info.roi.width or info.width,
+                info.roi.height or info.height, max(info.binning_x, 1), max(info.binning_y, 1))
+
     def scaled(self, x_offset: int, y_offset: int, width: int, height: int,
                binning_x: int = 1, binning_y: int = 1) -> CameraModel:
         """

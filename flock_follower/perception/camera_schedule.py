@@ -36,7 +36,7 @@ from flock_follower.messages import MAX_JUMP
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import NeighborFilter
-from flock_follower.perception.search import PORTIONS
+from flock_follower.perception.search import N_PORTIONS
 from flock_follower.perception.time_offset import MountedCamera
 
 #: Shortest time between two attempts to find a neighbour that another camera sees, s.
@@ -129,7 +129,7 @@ class CameraSchedule:
         if camera.searched == -math.inf:
             return 1
         waited = (abs(stamp - camera.searched) + 1e-3) / (self._cameras * PORTION_PERIOD)
-        return math.floor(min(waited, PORTIONS))
+        return math.floor(min(waited, N_PORTIONS))
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, although none is missing."""

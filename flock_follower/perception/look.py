@@ -37,6 +37,7 @@ from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
@@ -48,6 +49,8 @@ from flock_follower.perception.time_offset import MountedCamera
 #: A fit to a smeared marker starts from the estimate: after this time, s, without a measurement
 #: of another kind the marker is detected to confirm the fit.
 CONFIRM_PERIOD = 0.2
+#: Error of a measured direction that covariances of edges lack, px: blur, JPEG, and calibration.
+DIRECTION_ERROR = 0.06
 MAX_TURN = 0.3  # rad: a fit whose attitude differs by more from the detection's is replaced
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
@@ -123,6 +126,38 @@ def reported(estimate: Estimate, stamp: float, own: OdometrySample, attitude: fl
                              covariance=covariance)
 
 
+class MeasuredPose(NamedTuple):
+    """
+    A neighbor's body in the camera's optical frame, as measured in one image.
+
+    ``covariance`` (6, 6): position of the body, m, and rotation vector, rad, along the camera's
+    axes. The errors of the own attitude, with which the filter takes the measurement, are not in
+    it: they do not move a body in the camera's frame.
+    """
+
+    T_camera_body: Transform
+    covariance: Array
+
+    @classmethod
+    def of(cls, measurement: Measurement, T_camera_body: Transform, scales: tuple[float, float],
+           direction_noise: float, distance_noise: float) -> MeasuredPose:
+        """
+        Return the pose of a measurement.
+
+        :param T_camera_body: its pose, straightened.
+        :param scales: factors on its deviations of position and attitude.
+        :param direction_noise: of the line of sight, rad; :param distance_noise: a share of it.
+        """
+        scale = np.repeat(scales, 3)
+        covariance = measurement.covariance * np.outer(scale, scale)
+        sight = T_camera_body.apply(measurement.reference)
+        along = np.outer(sight, sight)
+        covariance[:3, :3] += direction_noise**2 * (
+            sight.dot(sight) * np.eye(3) - along) + distance_noise**2 * along
+        to_origin = to_body(T_camera_body.rotation.dot(measurement.reference))
+        return cls(T_camera_body, to_origin.dot(covariance).dot(to_origin.T))
+
+
 def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
     """
     Return how long after the first row a point (3,) in the optical frame was exposed, s.
@@ -171,7 +206,8 @@ class Sighting:
     The result of one image.
 
     ``estimates`` and ``measurements`` by neighbour's name, of the neighbours measured in this
-    image; ``stage`` is the costliest stage of detection that was used, 'none' if the image could
+    image; ``poses`` are the measured ones, except those whose attitude was not plausible;
+    ``stage`` is the costliest stage of detection that was used, 'none' if the image could
     not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
     for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
     by names made of the neighbours', are the states of candidates measured in this image that
@@ -186,6 +222,7 @@ class Sighting:
     other_ids: list[int] = field(default_factory=list)
     duplicates: dict[str, Estimate] = field(default_factory=dict)
     misprints: dict[str, Fault] = field(default_factory=dict)
+    poses: dict[str, MeasuredPose] = field(default_factory=dict)
 
     @property
     def stages(self) -> dict[str, str]:

@@ -17,9 +17,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from flock_follower.files import resource
+from flock_follower.geometry import Transform
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.cameras import CAMERA_SPECS, cameras, DEFAULT_POSITION, DEFAULT_RPY
 from flock_follower.parameters.spec import filled, Spec, specs_of
@@ -29,6 +31,10 @@ from flock_follower.perception.range_tracking import RangingParams
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.ranges import MAX_OFFSET, Range
+
+#: Of a neighbor as seen from a camera in a hand: the rotation of the camera moves it sideways.
+HAND_ACCELERATION = 4.0  # m/s^2
+HAND_ANGULAR_NOISE = 8.0  # rad/s^2/sqrt(Hz)
 
 RELATIVE_POSE = [
     Spec('neighbors_file', '',
@@ -55,6 +61,12 @@ RELATIVE_POSE = [
     Spec('max_wait', 0.35,
          'longest time for which an image waits for odometry of its stamp; less if odometry '
          'usually comes sooner', Range(0.0, 1.0, 's')),
+    Spec('odometry', 'odom',
+         'none: a detector alone, of a camera whose motion is unknown: neighbors are in its '
+         'optical frame, velocities relative to it', ('odom', 'none')),
+    Spec('publish_tf', True,
+         "publish each neighbor's pose on /tf, from the frame of odom to its name, if tf2_msgs is "
+         'installed'),
     *specs_of(FilterParams()),
     *specs_of(RangingParams()),
     *specs_of(SourceParams(), 'odom_'),
@@ -70,9 +82,17 @@ def tracker(values: Mapping[str, Any]) -> Tracker:
     """
     path = values['neighbors_file'] or resource('config/neighbors.yaml')
     fixed = values['time_offset_mode'] == 'fixed'
-    params = filled(FilterParams(), values)
+    params, alone = filled(FilterParams(), values), values['odometry'] == 'none'
+    if alone:
+        if any(values['cameras']):
+            raise ValueError('odometry = none: not with cameras: neighbors are in the frame of '
+                             'one')
+        params = replace(params, acceleration=max(params.acceleration, HAND_ACCELERATION),
+                         angular_noise=max(params.angular_noise, HAND_ANGULAR_NOISE))
     mounted = {camera.name: MountedCamera(
-        camera_mounting(camera.position, camera.rpy), TimeOffset(camera.time_offset, fixed),
+        Transform() if alone else camera_mounting(camera.position, camera.rpy),
+        TimeOffset(0.0, True) if alone else TimeOffset(camera.time_offset, fixed),
         camera.readout_time, params.attitude_noise, camera.rectified)
         for camera in cameras(values)}
-    return Tracker(load(path), mounted, params, ranging_params=filled(RangingParams(), values))
+    return Tracker(load(path), mounted, params, ranging_params=filled(RangingParams(), values),
+                   alone=alone)

@@ -23,11 +23,14 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from flock_follower.messages import (
     acceleration,
+    DUPLICATE,
     Make,
     odometry,
     OdometryChoice,
@@ -38,8 +41,10 @@ from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.perception.pose_sources import PoseSources
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
+from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseState
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
 WAITS = 50  # images over which the wait for odometry is observed
@@ -48,6 +53,7 @@ MARGIN = 0.03  # s more: odometry is late by now
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
+UNKNOWN_ATTITUDE = 10.0  # rad^2, variance of an attitude of which nothing is known
 _UNUSABLE = frozenset({NO_CAMERA, INVALID_IMAGE, *(missing.value for missing in Missing)})
 JUMPED = ('time jumped back', 'every track starts anew')
 
@@ -94,6 +100,7 @@ class _Calibrated:
         self.model: CameraModel | None = None
         self.fault = 'none came yet'
         self.calibration: tuple[Any, ...] = ()
+        self.frame = ''  # of the camera, optical
 
 
 class Perceiver:
@@ -113,6 +120,7 @@ class Perceiver:
         self._max_wait = max_wait
         self._waits: deque[float] = deque(maxlen=WAITS)  # of images that odometry reached, s
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
+        self.sources = PoseSources(tracker, max_wait)
         self._epoch: int | None = None
         self._pending: list[PendingImage] = []  # by stamp: one from the future blocks no other
 
@@ -139,19 +147,20 @@ class Perceiver:
         :raises ValueError: if it is unusable; no image is processed until a usable one comes.
         """
         roi = message.roi
-        window = (roi.x_offset, roi.y_offset, roi.width or message.width,
-                  roi.height or message.height, max(message.binning_x, 1),
-                  max(message.binning_y, 1))
         calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
-                       message.distortion_model, message.width, message.height, window)
+                       message.distortion_model, message.width, message.height,
+                       roi.x_offset, roi.y_offset, roi.width, roi.height,
+                       message.binning_x, message.binning_y)
         known = self._cameras[camera]
+        known.frame = message.header.frame_id
+        if known.frame:
+            self.sources.frames[known.frame] = self.tracker.cameras[camera].T_body_camera
         if calibration == known.calibration:
             return False
         known.model, known.calibration = None, ()
         try:
-            known.model = CameraModel.from_calibration(
-                message.k, message.d, message.distortion_model, message.width, message.height,
-                message.p, rectified=self.tracker.cameras[camera].rectified).scaled(*window)
+            known.model = CameraModel.from_info(
+                message, self.tracker.cameras[camera].rectified)
         except ValueError as error:
             known.fault = str(error)
             raise
@@ -168,12 +177,14 @@ class Perceiver:
             return False
         if self.frame not in ('', state.frame):
             self.tracker.restart()  # its estimates are in the old frame
+            self.sources.restart()
         self.frame = state.frame
         jumped = self.tracker.feed_odometry(OdometrySample(
             self._seconds(state.stamp), state.position, state.quaternion, state.velocity,
             state.angular_velocity, derived=state.derived))
         if jumped:
             self._pending.clear()
+            self.sources.restart()
         return jumped
 
     def take_image(self, message: Any, stamp: int, now: float,
@@ -184,9 +195,22 @@ class Perceiver:
         :param stamp: its stamp, ns.
         """
         image = PendingImage(now, stamp, self._seconds(stamp), message, camera)
+        if self.tracker.alone:
+            self._stand_still(image)
         insort(self._pending, image, key=lambda waiting: waiting.stamp_ns)
         most = MOST_PENDING * len(self._cameras)
         return self._pending.pop(0) if len(self._pending) > most else None
+
+    def _stand_still(self, image: PendingImage) -> None:
+        """Take the camera itself as the origin at the stamp of an image."""
+        header = getattr(image.message, 'header', None)
+        self.frame = self._cameras[image.camera].frame if header is None else header.frame_id
+        rest = np.zeros(3)
+        last = image.stamp + self.tracker.cameras[image.camera].readout_time
+        for stamp in sorted({image.stamp, last}):
+            if self.tracker.feed_odometry(OdometrySample(
+                    stamp, rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest)):
+                self._pending.clear()
 
     def process(self, now: float, clock: Callable[[], float] = lambda: 0.0,
                 shown: Callable[[str], bool] = lambda _: False) -> Processed | None:
@@ -233,14 +257,34 @@ class Perceiver:
         """Take a range, or return why not; it is used by ``tracker.ranging.due``."""
         return self.tracker.ranging.take(measured, self._seconds(measured.stamp))
 
+    def take_pose(self, name: str, state: PoseState, now: float) -> Rejection | None:
+        """Take a pose by another detector, or return why not; ``sources.due`` uses it."""
+        return self.sources.take(name, state, self._seconds(state.stamp), now, self.frame)
+
+    def take_frame(self, stamp: int, now: float) -> None:
+        """Take the stamp, ns, of an image that another detector processes."""
+        self.sources.take_frame(stamp, self._seconds(stamp), now)
+
     def messages(self, make: Make, stamp: int, name: str, estimate: Estimate) -> tuple[Any, Any]:
         """Return an estimate of a stamp, ns, as Odometry, and its AccelWithCovarianceStamped."""
-        twist = estimate.child_twist
+        twist, covariance = estimate.child_twist, estimate.pose_covariance
+        source = self.sources.sources.get(name.partition(DUPLICATE)[0])
+        if source is not None and source.position_only:
+            covariance[3:], covariance[:3, 3:] = 0.0, 0.0
+            covariance[3:, 3:] = UNKNOWN_ATTITUDE * np.eye(3)
         return odometry(
             make, stamp, self.frame, name, estimate.position, estimate.quaternion,
-            twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance,
+            twist[:3], twist[3:], covariance, estimate.child_twist_covariance,
         ), acceleration(make, stamp, name, estimate.child_acceleration,
                         estimate.child_acceleration_covariance)
+
+    def poses(self, make: Make, seen: Processed) -> Iterator[tuple[str, Any]]:
+        """Yield the topic and PoseWithCovarianceStamped of each pose measured in an image."""
+        image = seen.image
+        header = getattr(image.message, 'header', None)  # pixels have none
+        frame = self._cameras[image.camera].frame if header is None else header.frame_id
+        for name, measured in seen.sighting.poses.items():
+            yield pose_topic(name), pose_with_covariance(make, image.stamp_ns, frame, *measured)
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""

@@ -53,7 +53,7 @@ from flock_follower.perception.smear_fit import (
     SmearStart,
 )
 from flock_follower.perception.smear_print import smear_model, SmearModel
-from flock_follower.perception.square_pose import ippe, mirrored
+from flock_follower.perception.square_pose import ippe, mirror
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
@@ -289,7 +289,7 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Wh
 def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | None:
     """Return the pose of a neighbour mirrored about the sight of a marker; None if the same."""
     on_body = sought.neighbor.markers[index].T_body_marker
-    return mirrored(pose, pose.apply(on_body.translation[None])[0], on_body.rotation[:, 2])
+    return mirror(pose, pose.apply(on_body.translation[None])[0], on_body.rotation[:, 2])
 
 
 def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
@@ -341,7 +341,7 @@ def _scale(found: EdgeFit) -> float:
 
 def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     """Return the other pose that may suit the edges of a single marker, if there is one."""
-    start = mirrored(found.pose, found.center, found.lines.model.facings[0])
+    start = mirror(found.pose, found.center, found.lines.model.facings[0])
     if start is None:
         return []
     refitted = _refit(camera, found, start)

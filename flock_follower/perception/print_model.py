@@ -123,8 +123,8 @@ _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Further places at which a cell is read, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
-_MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide,
-_MOST_HIDDEN_TRACKED = 0.4  # and of a tracked marker
+_MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
+_MOST_HIDDEN_TRACKED = 0.4  # share of the inner cells of a tracked marker that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 

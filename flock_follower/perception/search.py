@@ -49,18 +49,18 @@ from flock_follower.perception.print_model import cell_code, shows_code
 #: Near an expected place the image is scaled so that the marker's side has this many px.
 SIDE = 56.0
 #: From this width on, px, a whole image is searched at half its size.
-LARGE = 1280
+LARGE_WIDTH = 1280
 _LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels; below about 12 they are noise
 _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astype(np.uint8)
 #: Side of the window for the mean, px, and of the brush that removes narrower areas. A narrow
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
-_WINDOWS = ((7, 1), (31, 1), (11, 3))
-#: A whole image is searched in so many portions, one in an image: quickly, and thoroughly with one
-#: window after the other, then at half the size with one that is as wide: a covered marker may
-#: have an outline only there.
+_SEARCH_WINDOWS = ((7, 1), (31, 1), (11, 3))
+#: Likewise for an image of half the size: a covered marker may have an outline only there.
 _HALVED = (15, 1)
-PORTIONS = 2 + len(_WINDOWS)
+#: Portions of the search of a whole image, one in an image: a quick one, a thorough one with each
+#: window, and one at half the size.
+N_PORTIONS = 2 + len(_SEARCH_WINDOWS)
 _DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
@@ -68,10 +68,11 @@ _STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are
 _HIDDEN = 0.35  # share of the visible area that a reflex may have hidden
 _SLIGHT = 0.05  # share of that: no reflex, but a blunt corner
 _MOST_CORNERS = 7  # of a hull: one with more is no square, whatever hides it
-#: A quadrilateral may be a marker if its cells, compared with their neighbours, correlate so much
-#: with the print. Of clutter, 99 % have less.
+#: Correlation of cells with the print, relative to the cells beside them, from which on a
+#: quadrilateral may be a marker. Of clutter, 99 % have less.
 _LIKENESS = 0.75
-_MOST_READ = 6  # of these are read cell by cell, the likest
+#: Number of quadrilaterals, the likest ones, that are read cell by cell.
+_MOST_READ = 6
 
 
 def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: MarkedNeighbor,
@@ -102,16 +103,17 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
 
 
 def everywhere(image: GrayImage, dictionary: str, markers: Sequence[Marker] | None = None,
-               border: int = 1, windows: Sequence[tuple[int, int]] = _WINDOWS) -> Detections:
+               border: int = 1,
+               windows: Sequence[tuple[int, int]] = _SEARCH_WINDOWS) -> Detections:
     """
     Return the markers in an image.
 
     :param markers: those to look for thoroughly; None: all of the dictionary, quickly.
     :param border: of a quick search, see ``markers.detect``.
-    :param windows: of a thorough search, as _WINDOWS.
+    :param windows: of a thorough search, as _SEARCH_WINDOWS.
     """
     height, width = image.shape
-    scale = 0.5 if width >= LARGE else 1.0
+    scale = 0.5 if width >= LARGE_WIDTH else 1.0
     return _search(image, (0, 0, width, height), scale, dictionary, markers, border, windows)
 
 
@@ -120,20 +122,20 @@ def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number
     """
     Return the markers that one portion of a search of the whole image finds.
 
-    :param number: below :data:`PORTIONS`; 0 is a quick search for all markers of the dictionary.
+    :param number: below :data:`N_PORTIONS`; 0 is a quick search for all markers of the dictionary.
     """
     if number == 0:
         return everywhere(image, dictionary, border=border)
-    if number <= len(_WINDOWS):
-        return everywhere(image, dictionary, markers, windows=_WINDOWS[number - 1:number])
+    if number <= len(_SEARCH_WINDOWS):
+        return everywhere(image, dictionary, markers, windows=_SEARCH_WINDOWS[number - 1:number])
     height, width = image.shape
-    return _search(image, (0, 0, width, height), 0.25 if width >= LARGE else 0.5, dictionary,
+    return _search(image, (0, 0, width, height), 0.25 if width >= LARGE_WIDTH else 0.5, dictionary,
                    markers, windows=(_HALVED,))
 
 
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,
             markers: Sequence[Marker] | None, border: int = 1,
-            windows: Sequence[tuple[int, int]] = _WINDOWS) -> Detections:
+            windows: Sequence[tuple[int, int]] = _SEARCH_WINDOWS) -> Detections:
     x0, y0, x1, y1 = region
     part = image[y0:y1, x0:x1]
     if scale != 1.0:
@@ -223,7 +225,7 @@ def _differences(side: int) -> Array:
 
 
 def quadrilaterals(logarithm: GrayImage,
-                   windows: Sequence[tuple[int, int]] = _WINDOWS) -> Array:
+                   windows: Sequence[tuple[int, int]] = _SEARCH_WINDOWS) -> Array:
     """Return the quadrilaterals, (n, 4, 2), px, clockwise, that may be the outlines of markers."""
     smooth = cv2.blur(logarithm, (3, 3))
     found = []

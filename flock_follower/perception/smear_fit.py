@@ -44,11 +44,11 @@ from flock_follower.perception.edges import (
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.print_model import median
 from flock_follower.perception.smear_print import (
-    FOCUSED,
     instants_of,
-    LENSES,
-    PER_CELL,
-    REACH,
+    LENS_BLURS,
+    N_FOCUSED,
+    SAMPLES_PER_CELL,
+    SEARCH_REACH,
     smear_print,
     SmearModel,
 )
@@ -93,7 +93,7 @@ class SmearFit(NamedTuple):
     ``pose`` is ``T_camera_body``; ``covariance`` (6, 6) is of the position of the marker's middle
     in the camera's optical frame, m, and of the rotation vector r in R_true = exp(r) R. ``rms``
     is the difference between image and print, as a share of the contrast. ``smear`` (2,), cells,
-    and ``lens``, an index of :data:`LENSES`, are the blur found.
+    and ``lens``, an index of :data:`LENS_BLURS`, are the blur found.
     """
 
     pose: Transform
@@ -105,7 +105,8 @@ class SmearFit(NamedTuple):
     @property
     def blur(self) -> float:
         """Return the standard deviation of the blur along the smear, cells."""
-        return math.sqrt(float(self.smear.dot(self.smear)) / 12.0 + float(LENSES[self.lens])**2)
+        by_lens = float(LENS_BLURS[self.lens])
+        return math.sqrt(float(self.smear.dot(self.smear)) / 12.0 + by_lens**2)
 
 
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
@@ -136,11 +137,11 @@ def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
     likeness = np.stack([cv2.matchTemplate(shown, smeared, cv2.TM_CCOEFF_NORMED)
                          for smeared in model.smeared])
     likeness[~np.isfinite(likeness)] = 0.0
-    likeness[[lens >= FOCUSED for lens in model.lenses]] -= _RARER
+    likeness[[lens >= N_FOCUSED for lens in model.lenses]] -= _RARER
     which, row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
     if not likeness[which, row, column] > _LIKENESS:
         return None
-    shift = (np.array([column, row]) - REACH) / PER_CELL
+    shift = (np.array([column, row]) - SEARCH_REACH) / SAMPLES_PER_CELL
     offset = start.rotation @ (shift @ model.axes)
     pose = Transform(start.rotation, start.translation + offset)
     return SmearStart(pose, model.smears[which], model.lenses[which])
@@ -201,7 +202,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
     weights, variance, response = np.ones(len(model.places)), _FLOOR**2, None
     for count in range(_PASSES):
         lens = _lens_of(camera, model, pose, lens)
-        at = _linearized(image, camera, model, SmearStart(pose, smear, lens), response)
+        at = _linearize(image, camera, model, SmearStart(pose, smear, lens), response)
         if at is None:
             return None
         # The steeper it is, the more the true blur of lens and cells matters.
@@ -238,14 +239,14 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
 
 def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int) -> int:
     """Return the index of the blur of a lens in focus at a pose; one out of focus stays."""
-    if lens >= FOCUSED:
+    if lens >= N_FOCUSED:
         return lens
     depth = float(pose.apply(model.middle[None])[0, 2])
     blur = _LENS * depth / (camera.matrix[0, 0] * model.cell)
-    return int(np.abs(LENSES[:FOCUSED] - blur).argmin())
+    return int(np.abs(LENS_BLURS[:N_FOCUSED] - blur).argmin())
 
 
-def _linearized(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
+def _linearize(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
                 response: list[float] | None) -> _Linear | None:
     """
     Return the print near ``start``; None if the image does not show it.
@@ -263,7 +264,7 @@ def _linearized(image: GrayImage, camera: CameraModel, model: SmearModel, start:
     usable = inside & (model.from_middle + 0.5 * np.abs(smear) < 0.5 * model.cells + _AROUND
                        ).all(axis=1)
     white, by_place, by_smear = smear_print(
-        model.printed[lens], model.places, smear, LENSES[lens])
+        model.printed[lens], model.places, smear, LENS_BLURS[lens])
     design = np.empty((len(white), 14))
     # Gamma and over-exposure bend what would be straight; light falls unevenly.
     bent = white * (1.0 - white)
@@ -314,7 +315,7 @@ def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | N
 
 def _shows_code(model: SmearModel, end: SmearStart, last: _Descent) -> bool:
     """Return whether no word suits the image better, and few cells were better turned."""
-    instants = instants_of(end.smear, LENSES[end.lens])
+    instants = instants_of(end.smear, LENS_BLURS[end.lens])
     at = np.rint(model.places + instants[:, None, None] * end.smear).astype(int)
     inner, count = model.cells - 2, len(model.places)
     within = ((at >= 1) & (at <= inner)).all(axis=2)

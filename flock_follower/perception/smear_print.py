@@ -35,21 +35,30 @@ from flock_follower.neighbors_file import Marker
 from flock_follower.perception.markers import marker_code
 from flock_follower.perception.print_model import cell_code
 
-#: Samples per cell, each way; beyond the black border; and away from where a marker is expected
-#: up to which it is looked for.
-PER_CELL = 3
-MARGIN = 1
-REACH = 8
-#: An instant of the exposure stands for so much motion at most, in standard deviations of the
-#: blur that there is without motion: with more, the instants were steps in the image.
+#: Samples per cell, along rows and along columns.
+SAMPLES_PER_CELL = 3
+#: Cells beyond the black border that are sampled.
+MARGIN_CELLS = 1
+#: Samples from the expected place of a marker up to which it is searched for.
+SEARCH_REACH = 8
+#: Motion per instant of the exposure at most, in standard deviations of the blur without motion:
+#: with more, the instants would show as steps.
 _STEP = 1.6
-_FEWEST, _MOST = 5, 15  # instants
-_TEXELS = 12  # of the print, per cell
-_WHITE = 3  # cells around, in the print
-#: Blur there is without motion, cells: of lenses, one taken to begin with, and out of focus.
-LENSES = np.array([0.07, 0.11, 0.17, 0.27, 0.4])  # with less, many instants were needed
-FOCUSED = 3  # so many of them are
-_SHARP = 1
+#: Fewest instants of an exposure.
+_MIN_INSTANTS = 5
+#: Most instants of an exposure.
+_MAX_INSTANTS = 15
+#: Texels of the print per cell.
+_TEXELS_PER_CELL = 12
+#: White cells around the print.
+_WHITE_CELLS = 3
+#: Blur without motion, cells: of lenses in focus, then out of focus; below 0.07 the instants would
+#: show as steps.
+LENS_BLURS = np.array([0.07, 0.11, 0.17, 0.27, 0.4])
+#: Number of the first of these that are in focus.
+N_FOCUSED = 3
+#: Index of the lens that is assumed first.
+_FIRST_LENS = 1
 #: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees. None is 0,
 #: where the squares have no slope by the vector and the descent stays.
 _LENGTHS = (0.2, 0.5, 1.0, 1.45)
@@ -65,7 +74,7 @@ class SmearModel:
     (s, 2), cells, how far off ``places`` are; ``across`` (s, 2) is -0.5 to 0.5 across the marker.
     ``cell``, m, is the length of a cell.
     ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
-    for each of :data:`LENSES`.
+    for each of :data:`LENS_BLURS`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
     ``smeared`` (t, k, k) the samples under them. ``codes`` (w, b): all codewords of the dictionary
     in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread: half of
@@ -81,24 +90,26 @@ class SmearModel:
             0.5 * (n - 1) * cell * np.array([[-1.0, 1.0, 0.0]]))[0]
         self.axes = cell * np.array([R[:, 0], -R[:, 1]])
         self.cell = cell
-        self.places, self.around = _samples(n, MARGIN), _samples(n, MARGIN + REACH)
+        self.places = _samples(n, MARGIN_CELLS)
+        self.around = _samples(n, MARGIN_CELLS + SEARCH_REACH)
         self.on_body = self.origin + self.places @ self.axes
         self.middle = self.origin + 0.5 * (n - 1) * self.axes.sum(axis=0)
         self.from_middle = np.abs(self.places - 0.5 * (n - 1))
         self.across = self.places / (n - 1) - 0.5
-        white = np.pad(printed, _WHITE, constant_values=True).astype(float)
-        level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
+        white = np.pad(printed, _WHITE_CELLS, constant_values=True).astype(float)
+        level = np.kron(white, np.ones((_TEXELS_PER_CELL, _TEXELS_PER_CELL)))
         self.printed: Any = np.array([_with_slopes(cv2.GaussianBlur(
-            level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
+            level, (0, 0), lens * _TEXELS_PER_CELL, borderType=cv2.BORDER_REPLICATE))
+            for lens in LENS_BLURS])
         angles = np.arange(4) * np.pi / 4
         self.smears = np.array([*(length * np.array([np.cos(a), np.sin(a)])
                                   for length in _LENGTHS for a in angles),
-                                *np.zeros((len(LENSES) - FOCUSED, 2))])
-        self.lenses = (_SHARP,) * (len(_LENGTHS) * len(angles)) + tuple(
-            range(FOCUSED, len(LENSES)))
-        size = n * PER_CELL + 2 * MARGIN
+                                *np.zeros((len(LENS_BLURS) - N_FOCUSED, 2))])
+        self.lenses = (_FIRST_LENS,) * (len(_LENGTHS) * len(angles)) + tuple(
+            range(N_FOCUSED, len(LENS_BLURS)))
+        size = n * SAMPLES_PER_CELL + 2 * MARGIN_CELLS
         self.smeared: Any = np.array([
-            smear_print(self.printed[lens], self.places, smear, LENSES[lens])[0]
+            smear_print(self.printed[lens], self.places, smear, LENS_BLURS[lens])[0]
             for lens, smear in zip(self.lenses, self.smears)]).reshape(-1, size, size).astype(
                 np.float32)
         code = cell_code(marker, dictionary)
@@ -113,12 +124,12 @@ smear_model = lru_cache(maxsize=64)(SmearModel)
 def _with_slopes(level: Array) -> Any:
     """Return how white a print is, and by how much more per cell to the right and down."""
     down, right = np.gradient(level)
-    return np.dstack([level, _TEXELS * right, _TEXELS * down]).astype(np.float32)
+    return np.dstack([level, _TEXELS_PER_CELL * right, _TEXELS_PER_CELL * down]).astype(np.float32)
 
 
 def _samples(cells: int, margin: int) -> Array:
     """Return places (s, 2), cells, that cover a marker and a margin, samples, around it."""
-    along = (np.arange(-margin, cells * PER_CELL + margin) + 0.5) / PER_CELL - 0.5
+    along = (np.arange(-margin, cells * SAMPLES_PER_CELL + margin) + 0.5) / SAMPLES_PER_CELL - 0.5
     return np.stack(np.meshgrid(along, along), axis=2).reshape(-1, 2)
 
 
@@ -131,7 +142,7 @@ def smear_print(printed: Any, places: Array, smear: Array,
     """
     instants = instants_of(smear, lens)
     at = places + instants[:, None, None] * smear
-    at = ((at + 0.5 + _WHITE) * _TEXELS - 0.5).astype(np.float32)
+    at = ((at + 0.5 + _WHITE_CELLS) * _TEXELS_PER_CELL - 0.5).astype(np.float32)
     seen = cv2.remap(printed, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
                      borderMode=cv2.BORDER_REPLICATE).reshape(len(instants), -1)
     mean, by_smear = _means(len(instants)).dot(seen).reshape(2, -1, 3).astype(float)
@@ -140,7 +151,8 @@ def smear_print(printed: Any, places: Array, smear: Array,
 
 def instants_of(smear: Array, lens: float) -> Array:
     """Return the instants (i,), -0.5 to 0.5, of an exposure for a smear and a blur, cells."""
-    return _instants(min(max(round(math.hypot(*smear.tolist()) / (_STEP * lens)), _FEWEST), _MOST))
+    count = round(math.hypot(*smear.tolist()) / (_STEP * lens))
+    return _instants(min(max(count, _MIN_INSTANTS), _MAX_INSTANTS))
 
 
 @lru_cache(maxsize=16)

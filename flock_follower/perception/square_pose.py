@@ -35,14 +35,14 @@ from flock_follower.perception.measurement import SAME_ATTITUDE
 
 def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
     """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
-    normalised = camera.undistort(corners)
-    if not np.all(np.isfinite(normalised)):
+    normalized = camera.undistort(corners)
+    if not np.all(np.isfinite(normalized)):
         return []
     # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
     # faces the camera upright is half a turn away from it. So it is given the square as if it
     # lay in the image, x right and y down, whichever of its corners is on top.
-    quarters = int(np.argmin(normalised.sum(axis=1)))
-    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
+    quarters = int(np.argmin(normalized.sum(axis=1)))
+    in_image = np.roll(normalized, -quarters, axis=0)[::-1]
     # Undistorted coordinates and an identity matrix serve every lens model alike.
     _, rotations, translations, _ = cv2.solvePnPGeneric(
         marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
@@ -78,7 +78,7 @@ def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
     return pose, jacobian
 
 
-def mirrored(pose: Transform, center: Array, facing_along: Array) -> Transform | None:
+def mirror(pose: Transform, center: Array, facing_along: Array) -> Transform | None:
     """
     Return a pose mirrored about the line of sight; None if it is the same.
 

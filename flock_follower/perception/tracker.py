@@ -50,8 +50,10 @@ from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import (
+    DIRECTION_ERROR,
     Look,
     MAX_TURN,
+    MeasuredPose,
     reported,
     row_delay,
     Sighting,
@@ -69,13 +71,18 @@ from flock_follower.perception.neighbor_filter import (
 from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranging, RangingParams
-from flock_follower.perception.time_offset import MountedCamera
+from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 
-#: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
-#: and otherwise in one of so many; of a smeared print in one of so many, if its probability was
-#: below SETTLED.
-MARGIN, MIRRORED_EVERY = 100.0, 30
-SMEARED_EVERY, SETTLED = 3, 0.05
+#: The mirrored attitude is fitted in every image while its chi^2 is within this of the other's.
+MARGIN = 100.0
+#: Images from one fit of the mirrored attitude to the next, otherwise.
+MIRRORED_EVERY = 30
+#: Images from one fit of the mirrored attitude of a smeared print to the next.
+SMEARED_EVERY = 3
+#: Probability of the mirrored attitude below which the other one is settled.
+SETTLED = 0.05
+#: Of a pose that another detector measured: it comes without an image.
+NO_IMAGE = CameraModel(np.eye(3), np.zeros(5), 'plumb_bob', 1, 1)
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -113,23 +120,31 @@ class Tracker:
     its stamp. A single camera has the name ''. All times of filters are by the odometry's clock.
 
     :param cameras: by name; of a single one its place on the body (optical) is enough.
+    :param alone: whether there is no odometry: every image is then taken from the origin, by a
+        camera of unknown attitude, and all states are relative to the camera.
     """
 
     def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
                  filter_params: FilterParams | None = None,
-                 ranging_params: RangingParams | None = None) -> None:
+                 ranging_params: RangingParams | None = None, alone: bool = False) -> None:
+        self.alone = alone
         self.config = config
         params = filter_params or FilterParams()
         if isinstance(cameras, Transform):
             cameras = {'': MountedCamera(cameras, attitude_noise=params.attitude_noise)}
         self.cameras = dict(cameras)
         self._odometry = OdometryBuffer()
-        self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
-        self._side = {n.name: max(m.side_length for m in n.markers) for n in config.neighbors}
+        marked = [n for n in config.neighbors if n.markers]
+        self._targets = {n.name: target(n, config.dictionary) for n in marked}
+        self._side = {n.name: max(m.side_length for m in n.markers) for n in marked}
         self._hypotheses = {n.name: Hypotheses(params) for n in config.neighbors}
         self._filters = {name: each.primary for name, each in self._hypotheses.items()}
+        self._marked = {n.name: self._filters[n.name] for n in marked}
+        self._sources = {n.name: MountedCamera(
+            Transform(), TimeOffset(fixed=True), attitude_noise=params.attitude_noise)
+            for n in config.neighbors if n.source is not None}
         self._by_marker = config.by_marker()
-        self._schedule = CameraSchedule(config.neighbors, len(self.cameras))
+        self._schedule = CameraSchedule(marked, len(self.cameras))
         self.ranging = Ranging(config.neighbors, self._filters, self._odometry, ranging_params)
         self._forget()
 
@@ -143,6 +158,8 @@ class Tracker:
             hypotheses.reset()
         for camera in self.cameras.values():
             camera.restart(self._targets)
+        for name, source in self._sources.items():
+            source.restart([name])
         self._schedule.restart()
         self.ranging.restart()
         self._planned: tuple[float, MountedCamera, Sought | Missing] | None = None
@@ -164,6 +181,20 @@ class Tracker:
         source = self.cameras[camera]
         last = stamp + source.time_offset.applied + source.readout_time
         return self._odometry.missing(last, extrapolate=False)
+
+    @property
+    def newest_odometry(self) -> float | None:
+        """Return the newest stamp of the odometry, s, or None without any."""
+        return self._odometry.newest
+
+    def missing_odometry(self, stamp: float) -> Missing | None:
+        """Return why there is no odometry of a stamp, s, yet, or None."""
+        return self._odometry.missing(stamp, extrapolate=False)
+
+    def attitude(self, stamp: float) -> Array | None:
+        """Return the own rotation (3, 3), body to odom, at a stamp, s, if known."""
+        own = self._odometry.at(stamp)
+        return None if isinstance(own, Missing) else quaternion_to_matrix(own.quaternion)
 
     def wanted(self, stamp: float, model: CameraModel, camera: str = '') -> bool:
         """
@@ -207,6 +238,29 @@ class Tracker:
         look.camera.vain.update((name, stamp + look.camera.time_offset.applied)
                                 for name in look.near if name not in look.measured)
         look.sighting.other_ids = sorted(set(look.sighting.other_ids))
+        return self._take(look)
+
+    def process_pose(self, stamp: float, name: str, T_frame_body: Transform, covariance: Array,
+                     T_body_frame: Transform | None) -> Sighting:
+        """
+        Return the estimate of a neighbor from its pose as another detector measured it.
+
+        :param covariance: (6, 6), position, m, and rotation vector, rad, along the frame's axes.
+        :param T_body_frame: the frame on the own body; None: the frame is that of odom.
+        """
+        camera = self._sources[name]
+        camera.T_body_camera = T_body_frame or Transform()
+        view = self._view(camera, stamp)
+        if isinstance(view, Missing):
+            return Sighting(rejections=[(view.value, '')])
+        if T_body_frame is None:
+            view = view._replace(T_smooth_camera=Transform(np.eye(3), -view.own.correction))
+        measurement = Measurement(name, T_frame_body, np.zeros(3), covariance, 0.0, None)
+        return self._take(Look(
+            stamp, stamp, camera, NO_IMAGE, view, [], [], {}, measured={name: measurement}))
+
+    def _take(self, look: Look) -> Sighting:
+        """Update the tracks with all measurements; return the sighting."""
         for measurement in (*look.measured.values(), *look.others):
             placed = self._placed(look, measurement)
             if placed is not None:
@@ -219,13 +273,13 @@ class Tracker:
     def _sought(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Sought | Missing:
         """Return the neighbours to look for in an image, or why that is not known."""
         if len(self.cameras) == 1:
-            return Sought([*self._filters], [*self._filters])
+            return Sought([*self._marked], [*self._marked])
         time = stamp + camera.time_offset.applied
         own = self._odometry.at(time)
         if isinstance(own, Missing):
             return own
         T_camera_odom = (own.smooth_pose @ camera.T_body_camera).inverse()
-        return self._schedule.sought(camera, time, model, T_camera_odom, self._filters)
+        return self._schedule.sought(camera, time, model, T_camera_odom, self._marked)
 
     def _look(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Look | Missing:
         """Return the expected content of an image, or why nothing is known."""
@@ -239,8 +293,14 @@ class Tracker:
         if isinstance(view, Missing):
             return view
         return Look(stamp, exposed, camera, model, view, *sought, {
-            name: view.prior(self._filters[name].predict(self._time(name, camera, exposed)))
+            name: self._prior(view, self._filters[name].predict(
+                self._time(name, camera, exposed)))
             for name in {*sought.near, *sought.anywhere}})
+
+    def _prior(self, view: View, estimate: Estimate | None) -> PosePrior:
+        """Return the expected pose; without odometry, the upward direction is unknown."""
+        prior = view.prior(estimate)
+        return prior._replace(up=None) if self.alone else prior
 
     def _view(self, camera: MountedCamera, exposed: float) -> View | Missing:
         """Return the view of a camera at a time by its clock, s."""
@@ -282,9 +342,9 @@ class Tracker:
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""
-        for name, hypotheses in self._hypotheses.items():
-            for candidate in hypotheses.candidates:
-                expected = look.view.prior(candidate.track.predict(
+        for name in self._marked:
+            for candidate in self._hypotheses[name].candidates:
+                expected = self._prior(look.view, candidate.track.predict(
                     self._time(name, look.camera, look.exposed)))
                 if expected.pose is not None and self._schedule.in_view(
                         name, look.model, expected.pose):
@@ -319,7 +379,7 @@ class Tracker:
             if look.missing:
                 markers = [m for n in look.missing for m in self._targets[n].neighbor.markers]
                 unseen = any(self._filters[name].newest is None for name in look.missing)
-                rounds, number = divmod(camera.portion, search.PORTIONS)
+                rounds, number = divmod(camera.portion, search.N_PORTIONS)
                 self._locate(search.portion(
                     image, dictionary, markers, number, prints.border_sought(rounds) if unseen
                     else prints.BORDERS[0]), 'full', image, look)
@@ -408,6 +468,11 @@ class Tracker:
             self._learn(camera, measurement, placed)
         sighting.measurements[name] = measurement
         sighting.estimates[name] = self._estimate(self._filters[name], look, placed)
+        if outcome is not UpdateOutcome.POSITION_ONLY and name in self._marked:
+            sighting.poses[name] = MeasuredPose.of(
+                measurement, placed.view.T_smooth_camera.inverse() @ placed.T_smooth_body,
+                camera.noise.scales, DIRECTION_ERROR / float(look.model.matrix[0, 0]),
+                camera.noise.distance)
 
     def _estimate(self, track_filter: NeighborFilter, look: Look, placed: _Placed) -> Estimate:
         """Return the state of a track at the image's stamp, in odom."""

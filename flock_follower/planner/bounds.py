@@ -282,7 +282,7 @@ def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
     """
     x, y, _ = offset.tolist()
     distance = math.hypot(x, y)
-    if distance < OVERHEAD:
+    if distance < OVERHEAD or not member.faces:  # without a marker it has no angle
         return []
     there = math.atan2(-y, -x)
     off = min((wrap_angle(there - yaw - face) for face in member.faces), key=abs)

@@ -30,6 +30,7 @@ import math
 
 import numpy as np
 
+from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bounds import (
     clear_of_sphere,
@@ -48,6 +49,7 @@ from flock_follower.planner.inputs import (
     Neighbor,
     OwnState,
     SEEN,
+    TRUSTED_TIME,
 )
 from flock_follower.planner.limits import (
     Bound,
@@ -59,7 +61,7 @@ from flock_follower.planner.limits import (
     LimitedCommand,
     SEPARATION,
 )
-from flock_follower.planner.memory import Loss, Memory
+from flock_follower.planner.memory import longest, Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.scene import Scene, silent
@@ -77,6 +79,7 @@ YIELD_MAX = 3.0  # m: ... but by no more than this
 SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
 BESIDE = 0.3  # ... unless it is on that side by this share of the distance
 FAILING_TIME = 0.5  # s that a follower whose computer failed flies on before it stops and hovers
+COVER_WIDTH = 0.8  # m off the line of sight up to which one in sight covers another
 CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is left ...
 OVERFLIGHT_CLIMB = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
@@ -176,12 +179,46 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     A leader is no faster than ``v_max``: the slower the vehicle may be, the shorter it retreats.
     The retreat is shorter by the distance beyond the band at the loss, too.
     """
-    coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
     distance = lost.free - float(lost.towards @ lost.origin)
     beyond = max(distance - math.sqrt(params.law.d1), 0.0)
-    longest = min(params.retreat_max,
-                  RETREAT_TIME * params.fastest if lost.name else UNKNOWN_PLACE)
-    return max(longest + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond, 0.0)
+    known = math.inf if lost.name else UNKNOWN_PLACE
+    return max(_longest_retreat(lost.approach, params, known) - beyond, 0.0)
+
+
+def _longest_retreat(approach: float, params: PlannerParams, known: float = math.inf) -> float:
+    """Return the largest retreat, m, from a neighbor that approached at a speed, m/s."""
+    coming = params.retreat_max > 0.0 and approach > APPROACH_NOISE
+    return min(params.retreat_max, RETREAT_TIME * params.fastest, known) + (
+        coming * min(YIELD_TIME * approach, YIELD_MAX))
+
+
+def retreat_velocity(memory: Memory, me: OwnState, params: PlannerParams) -> Array | None:
+    """
+    Return the velocity (3,), m/s, that keeps the distance to a neighbor that comes, or None.
+
+    The gate brakes to it if odometry is lost. Of several that come the nearest counts. As out of
+    sight, a neighbor also comes if it will in TRUSTED_TIME, and the retreat has a limit.
+    """
+    if not params.guard or params.retreat_max == 0.0:
+        return None
+    coming = list[tuple[float, float, Array]]()
+    for n in memory.flock.values():
+        if me.stamp - n.stamp > longest(n, params):
+            continue
+        it = _expected(n, memory, me, params)
+        soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
+        offset = LEVEL * (me.position - it.position)
+        distance = math.hypot(*offset.tolist())
+        away: Array = offset / max(distance, SHORTEST)
+        approach = max(float(away @ it.velocity), float(away @ soon.velocity))
+        if approach > APPROACH_NOISE:
+            coming.append((distance - params.radius - n.member.radius, approach, away))
+    if not coming:
+        return None
+    gap, approach, away = min(coming, key=lambda each: each[:2])
+    edges = Edges.of(params.law, params.guarding)
+    speed = approach - min(params.guarding.closing(gap - edges.near - edges.margin)[0], 0.0)
+    return min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP) * away
 
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
@@ -259,20 +296,27 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
             near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
-        if not here and not n.received and _covered(n, scene):
-            continue
         if here or not (name in memory.ranged or (scene.blinded and not n.received)):
             near += _neighbor_bounds(n, memory, scene, velocity, here, params)
     return ordered(near, fences(memory.lost, me.position, velocity, params),
                    _sight_bounds(memory, scene, velocity, view, params))
 
 
-def _covered(n: Neighbor, scene: Scene) -> bool:
-    """Return whether a lost neighbor is behind one in sight, which is nearer to both."""
-    apart = math.dist(n.position, scene.me.position)
-    return any(not each.received and each.name != n.name and max(
-        math.dist(each.position, scene.me.position), math.dist(each.position, n.position)) < apart
-        for each in scene.neighbors.flock)
+def _covered(it: Expected, scene: Scene) -> bool:
+    """
+    Return whether a lost neighbor is expected behind one in sight, on the line of sight.
+
+    It comes no nearer unseen than that one, whose own bound holds.
+    """
+    sight = it.position - scene.me.position
+    distance = math.hypot(*sight.tolist())
+    for each in scene.neighbors.flock:
+        offset = each.position - scene.me.position
+        along = float(offset @ sight) / max(distance, SHORTEST)
+        aside = math.sqrt(max(float(offset @ offset) - along ** 2, 0.0))
+        if not each.received and 0.0 < along < distance and aside < COVER_WIDTH:
+            return True
+    return False
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array, here: bool,
@@ -286,6 +330,9 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     places = [_hovering(n, params) if has_failed else _expected(n, memory, me, params)]
     if age > SEEN and not n.received:  # its acceleration is a guess: never chase
         places.append(expected(n, np.zeros(3), age, params))
+    if not (here or n.received):
+        places = [it._replace(spread=0.0, spreading=0.0) if _covered(it, scene) else it
+                  for it in places]
     # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
     headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
     found = list[Bound]()

@@ -241,7 +241,7 @@ class PlannerLoop:
         return decision, Command(
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.separation_axis,
             self._frame, stamp, nanoseconds - stamp, decision.altitude,
-            decision.state is State.RELATIVE)
+            decision.state is State.RELATIVE, decision.retreat)
 
     def _acceleration(self, n: OdometryState) -> Array | None:
         """Return the acceleration (3,), m/s^2, of a neighbor, by the message nearest in time."""

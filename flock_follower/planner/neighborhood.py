@@ -114,8 +114,10 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
         np.array([params.radius + n.member.radius for n in follow]), params.radius,
         np.array([n.name in held for n in follow]))
     seen = [n for n in follow if not n.received]
-    # A received position never removes the edge to the only leader in sight.
-    kept = [n.name for n in seen if len(seen) == 1 and n.member.role == LEADER]
+    # A received position never removes the edge to the only leader in sight. Beyond the band such
+    # an edge does not begin beside others: it would pull past the vehicle between.
+    kept = [n.name for n in seen if len(seen) == 1 and n.member.role == LEADER and (
+        not held or n.name in held or apart(n, me, params) ** 2 < params.law.d1)]
     return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 

@@ -61,6 +61,8 @@ class Decision(NamedTuple):
     """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
     separation_axis: Array | None = None
     """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
+    retreat: Array | None = None
+    """Velocity (3,), m/s, to brake to if odometry is lost; None: brake to a hover."""
     stamp: float | None = None
     """Stamp of the newest estimate on which the command rests, s; None without one."""
     limits: str = ''

@@ -33,7 +33,13 @@ import numpy as np
 
 from flock_follower.geometry import wrap_angle
 from flock_follower.planner import relative
-from flock_follower.planner.guard import climb_range, constrain, overflight, retreat
+from flock_follower.planner.guard import (
+    climb_range,
+    constrain,
+    overflight,
+    retreat,
+    retreat_velocity,
+)
 from flock_follower.planner.inputs import at, Neighbor, OwnState
 from flock_follower.planner.limits import SEPARATION
 from flock_follower.planner.memory import ingest, Memory
@@ -102,7 +108,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
             command.acceleration))
     return memory, Decision(
         state, reason, command.acceleration, yaw,
-        turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
+        turning(last_yaw, yaw, me, params, elapsed), command.separation_axis,
+        retreat_velocity(memory, me, params), stamp,
         command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
 

@@ -64,6 +64,7 @@ def test_a_file_of_ones_own_is_read_with_integers_and_single_values(tmp_path: Pa
     scenario = load(str(path))
     assert (scenario.name, scenario.duration, scenario.wind.speed) == ('mine', 30.0, (2.0, 2.0))
     assert parse(GOOD + 'variants:\n', 'mine.yaml') == parse(GOOD, 'mine.yaml')
+    assert parse(GOOD.replace('v_max: 2', 'K: 0.5'), 'mine').flight.planner(True).law.K == 0.5
     assert '| `name`' not in key_tables() and '| `outages` | [] |' in key_tables()
     assert scenario.leader.legs[0].velocity == (1.2, 0.0, 0.0)
 
@@ -76,7 +77,7 @@ FLOCK = 'summary: a test\nflock: {followers: 4, cameras: [front]}'
     (('v_max: 2', 'v_max: -1'), 'flight.v_max = -1.0: must be a number in [0.1, 5] m/s'),
     (('v_max: 2', 'd1: 0.5'),
      'flight.d1 = 0.5: must be a number in [d0 + 0.001, 10000] m^2, where d0 = 1.0'),
-    (('v_max: 2', 'vmax: 2'), 'flight.vmax: unknown key: must be one of beta, d0, d1, a_max'),
+    (('v_max: 2', 'vmax: 2'), 'flight.vmax: unknown key: must be one of K, beta, d0, d1, a_max'),
     (('motion: legs', 'motion: spiral'), "leader.motion = 'spiral': must be one of legs, circle"),
     (('motion: legs', 'motion: random_walk\n  climb: 0.5'),
      'leader.climb = 0.5: must be at most speed = 0.4'),

@@ -39,6 +39,7 @@ from flock_desk.flights import main
 from flock_desk.runs.processes import wait_until
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import (
+    FlightParams,
     LeaderMotion,
     Leg,
     Outage,
@@ -129,6 +130,16 @@ def test_a_second_print_is_kept_clear_of_and_never_followed() -> None:
     assert np.linalg.norm(offset, axis=2).min() > 0.9
     assert measure(flights)['min_separation'].min() > 0.9
     assert measure(flights)['max_separation'].max() < 3.5
+
+
+def test_a_leader_that_comes_while_odometry_is_lost_is_kept_clear_of() -> None:
+    """The autopilot has a velocity of its own; the follower hovered, and was met within 0.2 m."""
+    coming = LeaderMotion('legs', 2.0, acceleration=1.0, heading='away', legs=(
+        Leg(4.0, (1.0, 0.0, 0.0)), Leg(9.0, (-1.06, 0.0, 0.0))))
+    flights = fly(Scenario(
+        'gap', '', duration=12.5, flight=FlightParams(v_max=2.0), leader=coming,
+        outages=(Outage('vio', 7.5, 3.0),)), RUNS, True)
+    assert measure(flights)['min_separation'].min() >= 0.9
 
 
 def test_lost_odometry_is_braked_on_within_300_ms() -> None:

@@ -17,7 +17,7 @@
 import math
 
 from bridge_flight import Flight
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
@@ -58,6 +58,7 @@ ANY = arrays(float, 3, elements=st.floats(-1e300, 1e300))
 
 
 @given(st.lists(st.tuples(st.none() | ANY, st.none() | ANY, st.floats(-1.0, 1.0)), max_size=20))
+@example([(np.zeros(3), np.zeros(3), 0.1), (np.zeros(3), np.array([0.0, 0.0, 99.0]), 0.1)])
 def test_whatever_comes_the_estimate_is_bounded(steps):
     observer, now = DisturbanceObserver(), 0.0
     for sent, velocity, pause in steps:

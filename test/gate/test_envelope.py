@@ -21,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from situations import judge_situation
 
 from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import (
@@ -34,9 +35,9 @@ from flock_follower.gate.envelope import (
 )
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Permission
-from flock_follower.gate.relative_flight import Relative
-from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, Held
+from flock_follower.gate.setpoint_rules import BRAKE, COMMAND
 from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import MotionReport
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', True)
 STEP, CYCLE = 0.01, 5  # 20 Hz
@@ -64,9 +65,10 @@ class FlownGate:
     def _step(self, now, steps):
         gate = self.gate
         if steps % 2 == 0:
-            gate.update_velocity('odom', self.velocity, 0.02, now, position=self.position)
+            gate.take_motion('odom', MotionReport(self.velocity, position=self.position), 0.02,
+                             now)
         if steps % CYCLE == 0:
-            gate.update_height(self.position[2] + NOISE * self.rng.normal(), now)
+            gate.take_height(self.position[2] + NOISE * self.rng.normal(), now)
             if steps == 200:
                 gate.heights.refer(self.position[2], now)
             if self.commander is not None and steps % 10 == 0:
@@ -167,17 +169,15 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
     sent = []
     for k in range(400):
         now = 0.05 * k
-        gate.update_velocity('odom', 0.02 * rng.normal(size=3), 0.0, now)
-        gate.update_height(0.1 * rng.normal(), now)
+        gate.take_motion('odom', MotionReport(0.02 * rng.normal(size=3)), 0.0, now)
+        gate.take_height(0.1 * rng.normal(), now)
         if k == 20:
             gate.heights.refer(0.0, now)
         setpoint, _ = gate.decide(now)
         sent.append(setpoint)
         command = Command(rng.uniform(-2.0, 2.0, 3), 0.0)
-        sent.append(decide(limits, full=limits, known=gate._known(now), command=command,
-                           command_age=0.0, link_age=0.0, mode_age=0.0, armed=True,
-                           airborne=False, place=gate.place(now), withheld='', unplaced='',
-                           held=Held(), relative=Relative(), offset=np.zeros(3)))
+        sent.append(judge_situation(limits, gate.motion.known_motion(limits, now), command=command,
+                                    command_age=0.0, airborne=False, place=gate.place(now)))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0
 

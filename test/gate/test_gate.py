@@ -23,6 +23,7 @@ from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import MotionReport
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()
@@ -43,8 +44,8 @@ def flying_gate(limits=LIMITS, source='auto', now=0.0):
 
 def fresh_gate(now=10.0, velocity=(0.1, 0.0, 0.0), source='auto', limits=LIMITS):
     gate = flying_gate(limits, source, now)
-    assert gate.update_velocity('odom', velocity, 0.0, now) == ''
-    gate.update_yaw('odom', 0.5, now)
+    assert gate.take_motion('odom', MotionReport(velocity), 0.0, now) == ''
+    gate.motion.take_yaw('odom', 0.5, now)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, now) == ''
     return gate
 
@@ -60,15 +61,15 @@ def test_a_fresh_command_passes_unchanged():
         'command', 1.0, '', '')
     # In auto only until odometry has been heard is the autopilot's velocity enough.
     gate = flying_gate()
-    gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
+    gate.take_motion('autopilot', MotionReport([0, 0, 0]), 0.0, 10.0)
     gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
     assert decide(gate, 10.0).kind == 'command'
-    gate.update_velocity('odom', [0, 0, 0], 0.0, 9.0)
+    gate.take_motion('odom', MotionReport([0, 0, 0]), 0.0, 9.0)
     assert decide(gate, 10.0).reason == 'velocity from odom stale'
     # A vehicle replayed on the desk is judged by its own velocity only.
     gate = fresh_gate(velocity=(3.0, 0, 0), source='autopilot')
     assert decide(gate, 10.0).reason == 'no velocity from autopilot'
-    gate.update_velocity('autopilot', [0.0, 0.1, 0], 0.0, 10.0)
+    gate.take_motion('autopilot', MotionReport([0.0, 0.1, 0]), 0.0, 10.0)
     assert decide(gate, 10.0).kind == 'command'
 
 
@@ -76,13 +77,41 @@ def test_a_fresh_command_passes_unchanged():
 def test_a_command_older_than_the_planner_timeout_by_its_stamp_is_replaced_by_braking(age, until):
     gate = fresh_gate()
     assert gate.take_command(Command(FORWARD, 1.0), age, 10.0) == ''
-    gate.update_velocity('odom', [0.4, 0, 0], 0.0, until)
+    gate.take_motion('odom', MotionReport([0.4, 0, 0]), 0.0, until)
     # A refused command does not extend the life of the one before.
     assert gate.take_command(Command([math.nan, 0, 0], 0.0), 0.0, until - 0.001) == 'not finite'
     assert decide(gate, until - 0.001).kind == 'command'
     decision = decide(gate, until + 0.001)
     assert (decision.kind, decision.reason) == ('brake', 'command stale')
     np.testing.assert_allclose(decision.acceleration, [-0.4 / 0.3, 0, 0])
+
+
+def lost_odometry(command_time, now, autopilot=(-0.4, 0.0, 0.0), retreat=(-1.0, 0.0, 0.0)):
+    """Return the decision of a gate whose odometry ended at 10 s, beside a leader that came."""
+    gate = fresh_gate(limits=GateLimits(v_max=2.0))
+    command = Command(FORWARD, 1.0, retreat=np.array(retreat))
+    assert gate.take_command(command, 0.0, command_time) == ''
+    if autopilot is not None:
+        gate.take_motion('autopilot', MotionReport(autopilot), 0.0, now)
+    return decide(gate, now)
+
+
+def test_without_odometry_it_goes_on_backing_away_from_a_neighbor_that_came():
+    for now in (10.31, 12.99):
+        decision = lost_odometry(10.25, now)
+        assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
+        np.testing.assert_allclose(decision.acceleration, [-0.6 / 0.3, 0, 0])
+
+
+@pytest.mark.parametrize(('command_time', 'now', 'autopilot', 'retreat', 'acceleration'), [
+    (10.25, 13.01, (-0.4, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.4 / 0.3),  # too long ago
+    (9.95, 10.31, (-0.4, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.4 / 0.3),  # the planner failed first
+    (10.25, 10.31, (-0.4, 0.0, 0.0), (math.nan, 0.0, 0.0), 0.4 / 0.3),
+    (10.25, 10.31, None, (-1.0, 0.0, 0.0), 0.0),  # without any velocity: level
+    (10.25, 10.31, (-1.9, 0.0, 0.0), (-9.0, 0.0, 0.0), -0.1 / 0.3)])  # at most v_max
+def test_the_retreat_without_odometry_ends(command_time, now, autopilot, retreat, acceleration):
+    decision = lost_odometry(command_time, now, autopilot, retreat)
+    np.testing.assert_allclose(decision.acceleration, [acceleration, 0, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize(('age', 'reason'), [
@@ -106,14 +135,14 @@ def test_a_command_that_rests_on_an_old_image_is_refused(source_age, reason):
 def test_an_implausible_velocity_is_refused_and_the_last_one_counts(speed, reason):
     gate = fresh_gate()
     gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
-    assert gate.update_velocity('odom', [0.0, 0.0, -speed], 0.0, 10.1) == reason
+    assert gate.take_motion('odom', MotionReport([0.0, 0.0, -speed]), 0.0, 10.1) == reason
     assert decide(gate, 10.1).kind == 'command'
     assert decide(gate, 10.31).reason == 'velocity from odom stale'
 
 
 def test_late_odometry_brakes_more_softly_from_its_stamp_on():
     gate = flying_gate(LIMITS, 'odom')
-    assert gate.update_velocity('odom', [0.4, 0.0, 0.0], 0.15, 10.0) == ''
+    assert gate.take_motion('odom', MotionReport([0.4, 0.0, 0.0]), 0.15, 10.0) == ''
     decision = decide(gate, 10.1)
     assert (decision.kind, decision.reason) == ('brake', 'no command')
     np.testing.assert_allclose(decision.acceleration, [-0.4 / (0.3 + 0.2 * math.e), 0, 0])
@@ -122,36 +151,36 @@ def test_late_odometry_brakes_more_softly_from_its_stamp_on():
 def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one():
     gate = flying_gate()
     assert gate.take_command(Command(FORWARD, 0.0), 0.3, 10.0) == 'too old'
-    assert not gate.new_command
+    assert not gate.commands.is_new
     assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == ''
-    assert gate.new_command
+    assert gate.commands.is_new
     # Once, though it is not sent: without a velocity the gate levels the vehicle.
-    assert decide(gate, 10.0).kind == 'level' and not gate.new_command
+    assert decide(gate, 10.0).kind == 'level' and not gate.commands.is_new
     gate.permit(gate.permission.ended('hold'))
     assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == 'while GIVING_BACK'
-    assert not gate.new_command
+    assert not gate.commands.is_new
 
 
 @pytest.mark.parametrize(('flown', 'yaws'), [(True, (0.7, 0.7)), (False, (0.7, 0.9))])
 def test_the_yaw_is_held_from_the_moment_braking_begins_once_it_is_obeyed(flown, yaws):
     gate = fresh_gate() if flown else fly(Gate(), 10.0, NOT_FLOWN)
     for now, yaw, expected in zip((10.25, 10.3), (0.7, 0.9), yaws):
-        gate.update_yaw('autopilot', yaw, now)
+        gate.motion.take_yaw('autopilot', yaw, now)
         assert decide(gate, now).yaw == pytest.approx(expected)
 
 
 def test_yaws_are_compared_at_the_time_of_the_odometry():
     gate = Gate()
     for now in np.arange(10.0, 10.5, 0.02):
-        gate.update_yaw('autopilot', now - 10.0, now)  # it turns at 1 rad/s
-    gate.update_yaw('odom', 0.23, 10.23)
+        gate.motion.take_yaw('autopilot', now - 10.0, now)  # it turns at 1 rad/s
+    gate.motion.take_yaw('odom', 0.23, 10.23)
     assert gate.yaw_difference(10.48) == pytest.approx(0.0, abs=0.02)
 
 
 def test_a_height_that_ceases_hands_the_vehicle_over():
     gate = fresh_gate()
     for now in np.arange(10.0, 11.0, 0.05):
-        gate.update_height(2.0, now)
+        gate.take_height(2.0, now)
         gate.heights.refer(1.0, now)
         decide(gate, now)
     for now in np.arange(11.0, 14.9, 0.05):
@@ -166,12 +195,12 @@ def test_a_height_that_ceases_hands_the_vehicle_over():
 def test_displacements_that_differ_brake_and_hand_the_vehicle_over(
         axis, fused, distrusted, other):
     gate = fresh_gate()
-    gate.fused = fused
+    gate.autopilot = gate.autopilot._replace(fused=fused)
     for now in np.arange(10.0, 20.0, 0.05):
-        gate.update_velocity('odom', [0.0, 0.0, 0.0], 0.0, now)
-        gate.update_position('odom', 0.3 * (now - 10.0) * np.eye(3)[axis], now)
-        gate.update_position('autopilot', np.zeros(3), now)
-        gate.update_height(2.0, now)
+        gate.take_motion('odom', MotionReport([0.0, 0.0, 0.0]), 0.0, now)
+        gate.take_position('odom', 0.3 * (now - 10.0) * np.eye(3)[axis], now)
+        gate.take_position('autopilot', np.zeros(3), now)
+        gate.take_height(2.0, now)
         gate.take_command(Command(FORWARD, 1.0), 0.0, now)
         decision = decide(gate, now, distrusted=distrusted)
     assert (decision.kind == 'brake') == bool(other)
@@ -180,7 +209,7 @@ def test_displacements_that_differ_brake_and_hand_the_vehicle_over(
 
 def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_forgotten():
     gate = Gate(LIMITS)
-    assert gate.update_velocity('odom', (0.1, 0.0, 0.0), 0.0, 10.0) == ''
+    assert gate.take_motion('odom', MotionReport((0.1, 0.0, 0.0)), 0.0, 10.0) == ''
     gate.take_status(FLOWN, 10.0)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
     assert gate.decide(10.0)[0].kind == 'none'

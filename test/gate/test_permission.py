@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import pytest
 
 from flock_follower.gate.permission import (
-    FELL_SILENT,
+    Cause,
     LONGEST_SILENCE,
     NOT_REQUESTED,
     Permission,
@@ -125,7 +125,7 @@ def test_a_heartbeat_from_before_the_request_has_no_effect(received):
 def test_a_refused_request_ends_and_without_a_velocity_the_stream_falls_silent():
     assert after(ASKED, ('failed', 'refused')).announced() == 'INACTIVE: refused'
     silent = after(ASKED, seen(OURS), ('blinded', 'no velocity'))
-    assert silent.announced() == f'INACTIVE: {FELL_SILENT}: no velocity'
+    assert silent.announced() == 'INACTIVE: fell silent: no velocity'
     for idle in (after(), after(ASKED, seen(OURS), seen(PILOT))):
         assert next_permission(idle, ('failed', 'refused')) is idle
         assert next_permission(idle, ('blinded', 'no velocity')) is idle
@@ -225,4 +225,6 @@ def test_nothing_but_a_request_lets_the_stream_begin_and_only_active_obeys_comma
         if new and before.phase is Phase.ACTIVE and not (status.offboard and status.armed):
             assert not permission.streams
         assert (permission.reason == '') == (permission.phase is Phase.ACTIVE)
+        assert (permission.cause is None) == (permission.phase is Phase.ACTIVE)
+        assert (permission.cause is Cause.TAKEN) == (permission.phase is Phase.TAKEN_OVER)
         assert permission.reason != NOT_REQUESTED or permission == Permission()

@@ -21,19 +21,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from situations import judge_situation
 
 from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import approach_speed, GateLimits, Location
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.relative_flight import LONGEST_STEP, Reckoning, Relative
-from flock_follower.gate.setpoint_rules import COMMAND, decide, Held, LEVEL, NONE
+from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.gate.vehicle_status import VehicleStatus
-from flock_follower.gate.velocity_check import known_motion, Motion, ODOM
+from flock_follower.gate.velocity_check import known_motion, MotionReport, ODOM, SourceMotion
 from flock_follower.geometry import quaternion_from_rpy
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 
 LIMITS = GateLimits(relative_flight=True)
-LOST = Motion((0.3, 0.0, 0.0), 9.0), Motion(), ODOM
+LOST = SourceMotion((0.3, 0.0, 0.0), 9.0), SourceMotion(), ODOM
 FORWARD = Command((0.6, 0.0, 0.0), 1.0, relative=True)
 OFFBOARD = VehicleStatus(True, 'OFFBOARD', True)
 MANUAL = VehicleStatus(True, 'POSCTL', False)
@@ -42,12 +43,8 @@ MANUAL = VehicleStatus(True, 'POSCTL', False)
 def judge(limits=LIMITS, **changes):
     """Return the setpoint for a command on the marker alone, with some arguments changed."""
     arguments = {'known': known_motion(limits, *LOST), 'command': FORWARD,
-                 'command_age': 0.05, 'link_age': 0.1, 'mode_age': 0.5, 'armed': True,
-                 'place': Location(2.0), 'full': limits, 'airborne': True,
-                 'relative': Relative(5.0, False, 0.2),
-                 'withheld': '', 'unplaced': '', 'held': Held(),
-                 'offset': (0.0, 0.0, 0.0)}
-    return decide(limits, **{**arguments, **changes})
+                 'place': Location(2.0), 'relative': Relative(5.0)}
+    return judge_situation(limits, **{**arguments, **changes})
 
 
 def test_a_command_on_the_marker_alone_passes_as_it_is():
@@ -60,10 +57,10 @@ def test_a_command_on_the_marker_alone_passes_as_it_is():
 
 @pytest.mark.parametrize(('change', 'reason'), [
     ({'limits': GateLimits()}, 'relative command not permitted'),
-    ({'relative': Relative(math.nan, False, 0.2)}, 'relative command not permitted'),
-    ({'relative': Relative(30.1, False, 0.2)}, 'relative command not permitted'),
-    ({'relative': Relative(5.0, False, 0.51)}, 'marker lost'),
-    ({'relative': Relative(5.0, False, math.nan)}, 'marker lost'),
+    ({'relative': Relative(math.nan)}, 'relative command not permitted'),
+    ({'relative': Relative(30.1)}, 'relative command not permitted'),
+    ({'source_age': 0.51}, 'marker lost'),
+    ({'source_age': math.nan}, 'marker lost'),
     ({'place': Location(None)}, 'no height'), ({'place': Location(math.nan)}, 'no height'),
     ({'place': Location(2.0, math.inf)}, 'no height'), ({'airborne': False}, 'on the ground'),
     ({'unplaced': 'height stale'}, 'height stale'), ({'link_age': 1.01}, 'link lost'),
@@ -76,7 +73,7 @@ def test_each_obstacle_ends_it_as_the_loss_of_odometry_does_today(change, reason
 
 
 def test_while_it_begins_the_stream_goes_on_level():
-    begun = Relative(0.1, True, math.inf)
+    begun = Relative(0.1, True)
     assert judge(command=None, relative=begun).kind == LEVEL
     assert judge(command=None).kind == NONE
 
@@ -92,12 +89,13 @@ COMPONENT = ANY | st.floats(-3.0, 3.0) | st.floats(-1e300, 1e300)
        st.sampled_from([1.5, 2.5, 20.0]), st.booleans())
 @example((0.0, 0.0, -1.0), 0.0, 0.9, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 @example((0.0, 0.0, 1.0), 0.0, 9.6, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
+@example((1.5, 0.0, 0.0), 0.0, 5.0, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
         wanted, yaw, height, climb, lasted, marker_age, offset, a_max, airborne):
     limits = GateLimits(relative_flight=True, a_max=a_max)
     setpoint = judge(limits, command=Command(wanted, yaw, relative=True),
                      airborne=airborne, place=Location(height, climb), offset=offset,
-                     relative=Relative(lasted, False, marker_age))
+                     relative=Relative(lasted), source_age=marker_age)
     if setpoint.kind != COMMAND:
         assert not setpoint.acceleration.any()
         return
@@ -125,7 +123,7 @@ class Flown:
 
     def __init__(self, limits=LIMITS):
         self.gate, self.now, self.odometry = Gate(limits), 10.0, True
-        self.gate.update_height(2.0, self.now)
+        self.gate.take_height(2.0, self.now)
         self.gate.heights.refer(2.0, self.now)
         self.flown = []  # times of commands on the marker alone
 
@@ -136,9 +134,9 @@ class Flown:
         self.now += 0.05
         gate, now = self.gate, self.now
         gate.take_status(status, now)
-        gate.update_height(2.0, now)
+        gate.take_height(2.0, now)
         if self.odometry:
-            gate.update_velocity('odom', (0.1, 0.0, 0.0), 0.0, now)
+            gate.take_motion('odom', MotionReport((0.1, 0.0, 0.0)), 0.0, now)
         if command:
             gate.take_command(FORWARD._replace(relative=relative), 0.0, now, 0.1)
         setpoint = gate.decide(now)[0]
@@ -160,7 +158,7 @@ def test_it_begins_once_odometry_that_was_flown_on_is_lost_and_ends_when_it_retu
     assert vehicle.for_seconds(0.2, True).kind == COMMAND
     assert vehicle.for_seconds(0.4, True, command=False).kind == LEVEL
     assert vehicle.for_seconds(20.0, True).kind == COMMAND
-    motion = vehicle.gate.update_attitude(
+    motion = vehicle.gate.take_attitude(
         quaternion_from_rpy(0.0, 0.1, 0.5), np.zeros(3), vehicle.now, vehicle.now)
     assert (motion.frame, motion.position[2]) == ('flock_relative', 2.0)
     vehicle.odometry = True
@@ -225,7 +223,7 @@ def test_displacements_that_differ_are_flown_without_odometry_and_then_handed_ov
     vehicle.permit()
     for k in range(800):
         gate, now = vehicle.gate, vehicle.now
-        gate.update_position('odom', np.array([0.0, 0.0, 0.3 * max(now - 15.0, 0.0)]), now)
+        gate.take_position('odom', np.array([0.0, 0.0, 0.3 * max(now - 15.0, 0.0)]), now)
         vehicle.cycle(k > 150)
         if now < 35.0:
             assert not gate.handover(now)

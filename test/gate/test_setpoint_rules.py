@@ -21,30 +21,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from situations import judge_situation
 
 from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.permission import MODE_TIMEOUT
-from flock_follower.gate.relative_flight import Relative
-from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, Held, LEVEL, NONE
+from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, LEVEL, NONE
+from flock_follower.gate.situation import Held
 from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     FUTURE_TOLERANCE,
     known_motion,
-    Motion,
     ODOM,
+    SourceMotion,
 )
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.messages import FASTEST_OWN
 from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX, V_MAX
 
 LIMITS = GateLimits()
-UNKNOWN = Motion()
+UNKNOWN = SourceMotion()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
-SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
-USUAL = {'airborne': True, 'mode_age': 0.5, 'withheld': '', 'place': Location(), 'unplaced': '',
-         'relative': Relative(), 'offset': (0.0, 0.0, 0.0)}
-"""The arguments of a vehicle in the air of which nothing else is known."""
+SLOW = SourceMotion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
 KNOWN = ('odom', 'autopilot', 'source', 'disagreeing_for')
 
 
@@ -52,10 +50,8 @@ def judge(limits=LIMITS, **changes):
     """Return the setpoint of a healthy situation with some arguments changed."""
     known = {'odom': SLOW, 'autopilot': SLOW, 'source': ODOM}
     known.update((name, changes.pop(name)) for name in KNOWN if name in changes)
-    arguments = {
-        'known': known_motion(limits, **known), 'command': FORWARD, 'command_age': 0.05,
-        'link_age': 0.1, 'armed': True, 'held': Held(0.3), 'full': limits, **USUAL}
-    return decide(limits, **{**arguments, **changes})
+    return judge_situation(limits, known_motion(limits, **known),
+                           **{'command': FORWARD, 'held': Held(0.3), **changes})
 
 
 def same(setpoint, kind, reason, acceleration=(0.0, 0.0, 0.0), yaw=0.3, limited=''):
@@ -185,7 +181,7 @@ def test_braking_is_limited_to_a_max_as_a_vector():
 @pytest.mark.parametrize(('age', 'more'), [
     (-0.1, 0.0), (0.0, 0.0), (0.05, 0.0), (0.1, 0.05 * math.e), (0.3, 0.25 * math.e)])
 def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
-    late = Motion((0.4, 0.0, 0.0), age)
+    late = SourceMotion((0.4, 0.0, 0.0), age)
     same(judge(GateLimits(brake_time=0.5), command=None, odom=late, autopilot=UNKNOWN), BRAKE,
          'no command', (-0.4 / (0.5 + more), 0.0, 0.0))
     same(judge(odom=late, autopilot=UNKNOWN), COMMAND, '', (0.1 / (0.3 + more), 0.0, 0.0),
@@ -201,7 +197,7 @@ def test_a_height_that_is_held_does_not_swing_however_late_the_velocity(delay):
     heights, rates, acceleration, commanded = [2.4] * 50, [0.0] * 50, 0.0, 0.0
     for k in range(3000):
         if k % 5 == 0:
-            late = Motion((0.0, 0.0, rates[-1 - round(delay / step)]), delay, 0.3, delay)
+            late = SourceMotion((0.0, 0.0, rates[-1 - round(delay / step)]), delay, 0.3, delay)
             place = Location(height=heights[-6], climb_rate=late.velocity[2])
             commanded = judge(command=None, odom=late, autopilot=UNKNOWN, held=Held(0.3, 2.0),
                               place=place).acceleration[2]
@@ -237,7 +233,7 @@ ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
 NUMBER = ANY | st.floats(-4.0, 4.0)
 AGE = st.sampled_from([0.0, 0.05, 0.15, 0.29, 0.31, 1.5, 5.0, -0.05, -0.5]) | ANY
 VECTOR = st.tuples(NUMBER, NUMBER, NUMBER) | st.lists(NUMBER, max_size=4)
-MOTION = st.builds(Motion, VECTOR, AGE, NUMBER, AGE)
+MOTION = st.builds(SourceMotion, VECTOR, AGE, NUMBER, AGE)
 BOTH_MOTIONS = st.fixed_dictionaries({
     'odom': MOTION, 'autopilot': MOTION, 'source': st.sampled_from([ODOM, AUTOPILOT])})
 LIMIT_SETS = st.builds(
@@ -278,8 +274,8 @@ def usable(motion):
 @given(LIMIT_SETS, BOTH_MOTIONS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments):
     setpoint, again, still = (
-        decide(limits, full=limits, known=known_motion(limits, **both), relative=Relative(),
-               **arguments | change) for change in ({}, {}, {'offset': np.zeros(3)}))
+        judge_situation(limits, known_motion(limits, **both), **arguments | change)
+        for change in ({}, {}, {'offset': np.zeros(3)}))
     command = arguments['command']
     # It is a pure function.
     assert again._replace(acceleration=None) == setpoint._replace(acceleration=None)
@@ -321,13 +317,12 @@ def test_the_offset_is_added_to_the_command_except_along_too_fast_a_velocity(
         a_max, v_max, direction, speed, wanted, offset, axis, commanded):
     limits = GateLimits(a_max=a_max, v_max=v_max)
     v = speed * v_max * np.array(direction) / np.linalg.norm(direction)
-    motion = Motion(tuple(v), 0.02)
+    motion = SourceMotion(tuple(v), 0.02)
     unit = None if axis is None else np.array([math.cos(axis), math.sin(axis), 0.0])
     known = known_motion(limits, motion, motion, ODOM)
-    still, sent = (decide(
-        limits, full=limits, known=known, command_age=0.05, link_age=0.1, armed=True,
-        command=Command(wanted, 0.5, 0.0, unit) if commanded else None, held=Held(),
-        **USUAL | {'offset': each}).acceleration for each in (np.zeros(3), offset))
+    still, sent = (judge_situation(
+        limits, known, command=Command(wanted, 0.5, 0.0, unit) if commanded else None,
+        offset=each).acceleration for each in (np.zeros(3), offset))
     expected = np.clip(offset, (-9.0, -9.0, -THRUST_OFFSET_MAX), (9.0, 9.0, THRUST_OFFSET_MAX))
     if speed > 1.1:
         expected = expected - max(expected @ v, 0.0) / (v @ v) * v
@@ -356,14 +351,13 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
     full = GateLimits(a_max=a_max, v_max=v_max)
     limits = GateLimits(a_max=max(lower * a_max, A_MAX.low), v_max=v_max)
     wanted = (1.0 - short) * limits.a_max * np.array(direction) / np.linalg.norm(direction)
-    motion = Motion(tuple(speed * v_max * np.array(velocity) / np.linalg.norm(velocity)), 0.02)
+    motion = SourceMotion(
+        tuple(speed * v_max * np.array(velocity) / np.linalg.norm(velocity)), 0.02)
     unit = None if axis is None else np.array(axis) / np.linalg.norm(axis)
-    setpoint = decide(
-        limits, full=full, known=known_motion(limits, motion, motion, ODOM),
-        link_age=0.1, mode_age=0.5, armed=True, command_age=0.05,
+    setpoint = judge_situation(
+        limits, known_motion(limits, motion, motion, ODOM), full=full,
         command=Command(wanted, 0.5, 0.0, unit) if commanded else None,
-        airborne=airborne, held=Held(0.5, 2.0), offset=(*wind[:2], offset), withheld='',
-        unplaced='', relative=Relative(),
+        airborne=airborne, held=Held(0.5, 2.0), offset=(*wind[:2], offset),
         place=Location(height, climb_rate, np.array([out, 0.0])))
     assert setpoint.kind == (COMMAND if commanded else BRAKE)
     assert norm_on_wire(setpoint) <= (limits if commanded and axis is None else full).a_max
@@ -373,7 +367,7 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
                                   (0.0, 1e200, 0.0), (0.0, -1e300, 1.0), (0.0, 3.0, 0.0),
                                   (0.0, 0.0, 0.0)])
 def test_a_direction_that_is_none_changes_nothing(axis):
-    known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
+    known = SourceMotion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
     evade, lowered = Command((0.0, 2.5, 0.0), 0.0), GateLimits(a_max=1.5)
     np.testing.assert_array_equal(
         judge(lowered, command=evade._replace(separation_axis=axis), odom=known,

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.obstacle import Obstacle
 from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     difference,
@@ -27,19 +28,18 @@ from flock_follower.gate.velocity_check import (
     finite_vector,
     known_motion,
     LATCH_TIME,
-    Motion,
     ODOM,
     Path,
     Source,
+    SourceMotion,
     VelocityComparison,
     WINDOW,
     YAW_MEMORY,
-    YAWS_DISAGREE,
 )
 
 LIMITS = GateLimits()
-SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
-ACROSS = Motion((0.0, 0.2, 0.0), 0.02, 0.5, 0.02)
+SLOW = SourceMotion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
+ACROSS = SourceMotion((0.0, 0.2, 0.0), 0.02, 0.5, 0.02)
 LATE = {'velocity_age': 0.4}
 
 
@@ -65,7 +65,7 @@ def test_what_is_not_three_finite_numbers_is_no_vector(value):
 def test_the_difference_of_yaws_is_wrapped_and_signed_and_has_a_limit(yaw, own, turned):
     known = by(ODOM, odom=SLOW._replace(yaw=yaw), autopilot=ACROSS._replace(yaw=own))
     assert known.turned == pytest.approx(turned)
-    assert known.contradiction == (YAWS_DISAGREE if abs(turned) == 0.4 else '')
+    assert known.contradiction == (Obstacle.YAWS_DISAGREE if abs(turned) == 0.4 else None)
     # Of just the limit is none.
     assert not by(ODOM, GateLimits(yaw_disagreement=0.4), odom=SLOW._replace(yaw=yaw),
                   autopilot=ACROSS._replace(yaw=own)).contradiction
@@ -77,7 +77,7 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     turned = SLOW._replace(yaw=2.5)
     for known in (by(ODOM, odom=turned, autopilot=SLOW._replace(**unusable)),
                   by(ODOM, odom=turned._replace(**unusable), autopilot=SLOW)):
-        assert known.turned is None and known.contradiction == ''
+        assert known.turned is None and known.contradiction is None
 
 
 @pytest.mark.parametrize(('known', 'velocity'), [
@@ -216,7 +216,7 @@ def test_displacements_that_differ_beyond_their_deviations_are_reported(
     why = displaced(odom, None if height else autopilot, 0.0,
                     autopilot.path if height else Path(), 4.0)
     assert bool(why) == contradicts
-    assert not why or ('barometer' in why) == height
+    assert not why or ('barometer' in why.detail) == height
 
 
 def test_the_yaw_nearest_to_a_time_is_returned_and_old_ones_are_forgotten():

@@ -127,7 +127,8 @@ def test_a_third_autopilot_is_one_record(monkeypatch):
     assert bridge.telemetry.dialect is None
     cycle(heartbeat(third.firmware), mavlink.MAVLink_estimator_status_message(
         0, mavlink.ESTIMATOR_ATTITUDE, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert bridge.telemetry.dialect is third and bridge.gate.hover_thrust == 'THIRD_HOVER'
+    assert bridge.telemetry.dialect is third
+    assert bridge.gate.autopilot.hover_thrust == 'THIRD_HOVER'
     assert bridge.distrusted(now) == 'is invalid according to its estimator'
     asked = [mavlink.MAVLink(None).decode(bytearray(data)) for data in line.written]
     assert 'THIRD_LOSS' in [m.param_id for m in asked if m.get_type() == 'PARAM_REQUEST_READ']

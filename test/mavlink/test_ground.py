@@ -19,9 +19,10 @@ import numpy as np
 import pytest
 
 from flock_follower.gate.gate import Gate
-from flock_follower.gate.permission import Permission
+from flock_follower.gate.permission import Cause, Permission
 from flock_follower.gate.setpoint_rules import NONE
 from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import MotionReport
 
 pytestmark = pytest.mark.slow
 OURS = VehicleStatus(True, 'OFFBOARD', True)
@@ -41,12 +42,12 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
     ended = []
     for k in range(60):
         now = 1.0 + 0.05 * k
-        control.update_velocity('odom', np.zeros(3), 0.0, now)
+        control.take_motion('odom', MotionReport(np.zeros(3)), 0.0, now)
         if height is not None:
-            control.update_height(50.0, now)
+            control.take_height(50.0, now)
             if k == 0:
                 control.heights.refer(height, now)
         control.take_status(OURS, now, airborne=k < 20)
         ended.append(control.decide(now)[0].kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
-    assert control.permission == Permission(reason='on the ground')
+    assert control.permission == Permission(reason='on the ground', cause=Cause.LANDED)

@@ -28,6 +28,7 @@ from flock_follower.gate.envelope import (
     STEP_PAUSE,
     TIMEOUT,
 )
+from flock_follower.gate.obstacle import Obstacle
 
 PERIOD = 0.05
 NOISE = 0.09  # m: SCALED_PRESSURE of PX4 1.16, SIH
@@ -86,19 +87,19 @@ def test_a_jump_without_matching_velocity_shifts_the_reference_and_is_counted(ju
 
 def test_for_a_while_after_a_jump_the_height_is_lost():
     heights, _ = flown(10.3, lambda t: 1.0 * (t > 10.0))
-    assert heights.lost(10.25) == 'height jumped'
-    assert heights.lost(10.25 + STEP_PAUSE + 0.1) == 'height stale'
-    assert flown(12.0, lambda t: 1.0 * (t > 10.0))[0].lost(12.0) == ''
+    assert heights.obstacle(10.25) is Obstacle.HEIGHT_JUMPED
+    assert heights.obstacle(10.25 + STEP_PAUSE + 0.1) is Obstacle.HEIGHT_STALE
+    assert flown(12.0, lambda t: 1.0 * (t > 10.0))[0].obstacle(12.0) is None
 
 
 def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     heights = HeightEstimator()
-    assert heights.height(0.0) is None and heights.lost(0.0) == ''
+    assert heights.height(0.0) is None and heights.obstacle(0.0) is None
     heights.take(50.0, None, 1.0)
     assert heights.height(1.0) is None and heights.altitude(1.0) == 50.0
     heights.refer(1.5, 1.0)
     assert heights.height(1.0) == 1.5
-    assert heights.height(1.01 + TIMEOUT) is None and heights.lost(1.01 + TIMEOUT)
+    assert heights.height(1.01 + TIMEOUT) is None and heights.obstacle(1.01 + TIMEOUT)
     heights.take(52.0, None, 9.0)  # it comes back
     assert heights.height(9.0) == 3.5
     heights.refer(None, 9.0)
@@ -130,7 +131,8 @@ def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
     heights.take(492.0, None, 0.1 + TIMEOUT, 'SCALED_PRESSURE')
     assert not heights.referenced and heights.height(0.1 + TIMEOUT) is None
     # The vehicle must not fly on without its bounds.
-    assert heights.missing(0.1 + TIMEOUT) and heights.lost(0.1 + TIMEOUT) == 'height stale'
+    assert heights.missing(0.1 + TIMEOUT) and heights.obstacle(0.1 + TIMEOUT) is (
+        Obstacle.HEIGHT_STALE)
 
 
 def test_a_jump_of_the_barometer_corrects_the_vertical_velocity_by_its_bound_at_most():

@@ -73,7 +73,7 @@ def judged(dialect, *messages):
     watch = TakeoverWatch()
     for after, message in messages:
         watch.take(message, dialect, LEFT + after)
-    return watch.cause(dialect, LEFT)
+    return watch.taker(dialect, LEFT)
 
 
 FAILSAFE = 0.0, mode(PX4, 'AUTO.RTL', 'OFFBOARD')
@@ -131,7 +131,7 @@ def test_the_failsafe_of_the_real_ardupilot_without_vision_is_named():
         if left is None and message.get_type() == 'HEARTBEAT' and (
                 ARDUPILOT.mode_name(message.custom_mode) == 'LAND'):
             left = time
-    assert watch.cause(ARDUPILOT, left) == failsafe(ESTIMATE)
+    assert watch.taker(ARDUPILOT, left) == failsafe(ESTIMATE)
 
 
 @pytest.mark.parametrize(('name', 'cause'), [
@@ -146,7 +146,7 @@ def test_who_took_over_on_the_real_px4_is_named(name, cause):
             before, flown = flown, PX4.mode_name(message.custom_mode)
             if before == PX4.offboard != flown:
                 left = time
-    assert watch.cause(PX4, left) == cause
+    assert watch.taker(PX4, left) == cause
 
 
 # Through the bridge.
@@ -199,4 +199,4 @@ def test_px4s_own_failsafe_is_no_pilot_and_bars_nothing():
     # A pilot after a failsafe bars offboard from then on.
     flight.controller.pilot_switches('POSCTL')
     flight.fly(1.0)
-    assert flight.bridge.gate.permission.cause == PILOT
+    assert flight.bridge.gate.permission.taker == PILOT

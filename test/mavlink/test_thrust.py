@@ -21,6 +21,7 @@ import pytest
 
 from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.velocity_check import MotionReport
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.planner.loop import PlannerLoop
@@ -71,8 +72,8 @@ class FollowingFlight(Flight):
         time, position, velocity, yaw = self.known[-1 - min(
             round(LATE / STEP_TIME), len(self.known) - 1)]
         arrival = round(now * NANOSECONDS)
-        self.bridge.gate.update_velocity('odom', velocity, now - time, now, yaw=yaw,
-                                         position=position)
+        self.bridge.gate.take_motion(
+            'odom', MotionReport(velocity, yaw, position), now - time, now)
         self.loop.take_odometry(state(time, 'base_link', position, velocity, yaw), arrival)
         if self.steps % 3 == 0:
             seen = now - SEEN_LATE

@@ -35,6 +35,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.command_messages import Command, trajectory
 from flock_follower.gate.setpoint_rules import COMMAND
+from flock_follower.gate.situation import Situation
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
 from flock_follower.mavlink.commands import Outcome
@@ -44,7 +45,7 @@ from flock_follower.messages import to_array
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 
-OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'update_velocity', 'forward',
+OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'take_motion', 'forward',
          'receive', 'cycle', 'stop')
 POSCTL, OFFBOARD = 3 << 16, 6 << 16
 SERVICES = {'offboard': SetBool, 'arm': SetBool, 'takeoff': Trigger, 'land': Trigger}
@@ -210,6 +211,11 @@ def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_br
     reason = bench.bridge.gate.permission.reason
     assert reason == 'two nodes command:  on /command/trajectory' and reason in bench.problems()
     assert sum('numbers no messages' in text for text in bench.log) == 1
+    # What ended the flight can be decided again.
+    begin = 'situation of the last decision: '
+    bench.wait(lambda: any(text.startswith(begin) for text in bench.log))
+    line = next(text for text in bench.log if text.startswith(begin)).removeprefix(begin)
+    assert Situation.from_json(line).report.armed
 
 
 def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(make_bench):
@@ -240,7 +246,7 @@ def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(
 def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_bench):
     bench = make_bench()
     bench.odometry(late=150_000_000)
-    known = bench.bridge.gate._sources['odom']
+    known = bench.bridge.gate.motion.odometry
     bench.wait(lambda: known.velocity_time > 0.0)
     # Both the velocity and the yaw: lost odometry brakes no later for having been polled.
     for age in (known.velocity_time, known.yaw()[1]):
@@ -308,7 +314,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     bench.codec.srcSystem = 1
     bench.beat()
     bench.wait(lambda: bench.bridge.alive(time.monotonic()))
-    bench.node._report._start -= 4.0
+    bench.node._report.problems._start -= 4.0
     found = bench.problems()
     for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION', 'forward_odometry: none sent',
                  'mavlink_bridge/offboard to request offboard'):
@@ -319,7 +325,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     assert not bench.ask('offboard', True).success
     bench.node._stream.stop()
     # Neither does anything leave, nor does anything come.
-    last = bench.node._report._last.setpoint
+    last = bench.node._report.problems._last.setpoint
     bench.node._report.on_cycle(
         Cycle(last._replace(kind=COMMAND), False, None), time.monotonic())
     assert 'no setpoint was sent for 1.0 s' in bench.problems(ahead=1.0)
@@ -384,7 +390,7 @@ def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_r
     for values, said in (
             ({'v_max': 0.5, 'a_max': 2.5}, ''), ({'v_max': None}, ''),
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge')):
-        bench.node._report.planner.values = values
+        bench.node._report.problems.planner.values = values
         found = bench.problems()
         assert said in found and bool(said) == ('of the planner' in found)
     assert bench.values['parameters'] == '2 of 3 differ, 0 unanswered'
@@ -399,7 +405,7 @@ def test_a_node_with_other_parameters_in_flight_is_named(make_bench, armed):
     bench = make_bench()
     bench.beat(armed=armed)
     bench.wait(lambda: bench.bridge.telemetry.status is not None)
-    planner = bench.node._report.planner
+    planner = bench.node._report.problems.planner
     planner.take({'v_max': 0.5, 'd0': 1.0})
     assert 'changed in flight' not in bench.problems()
     planner.take({'v_max': 0.5, 'd0': 2.0})  # a planner that was started with another file

@@ -29,7 +29,7 @@ from rclpy.node import Node
 
 from flock_desk.program import NODES, PROGRAMS
 from flock_follower.files import resource
-from flock_follower.nodes.support import runtime
+from flock_follower.nodes.support import process
 from flock_follower.nodes.support.runtime import FlockNode
 
 BRIDGE = 'connection:=udpin:127.0.0.1:0'
@@ -68,7 +68,7 @@ def test_a_node_is_destroyed_once_it_is_spun_and_not_by_the_signal() -> None:
     def spin(_: Noted) -> None:
         rclpy.get_default_context().try_shutdown()  # what the handler of a signal calls
         order.append('spun')
-    assert runtime.run(lambda: Noted('noted'), [], spin) == 0
+    assert process.run(lambda: Noted('noted'), [], spin) == 0
     assert order == ['spun', 'destroyed']
 
 

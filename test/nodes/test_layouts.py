@@ -57,7 +57,8 @@ def topics(nodes: dict[str, Node]) -> dict[str, Any]:
 
 def test_the_table_from_which_a_policy_is_written_is_that_of_the_nodes(
         nodes: dict[str, Node]) -> None:
-    rows = re.findall(r'^\| `(\w+)` \|(.*)\|(.*)\|(.*)\|$', PAGE.read_text(), re.M)
+    rows = re.findall(r'^- `(\w+)` publishes\s+(.*?);\s+subscribes\s+(.*?);\s+serves\s+(.*?)\.$',
+                      PAGE.read_text(), re.M | re.S)
     assert len(rows) == 3
     for name, *cells in rows:
         node = nodes[name]

@@ -28,6 +28,7 @@ from marker_images import make_camera, render
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, Range, RegionOfInterest
+from std_msgs.msg import Header
 
 from flock_follower.geometry import (
     quaternion_from_rpy,
@@ -49,6 +50,7 @@ from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
+from flock_follower.pose_messages import from_pose
 
 CAMERA = make_camera()
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
@@ -158,6 +160,25 @@ def test_an_image_becomes_a_neighbor_in_the_frame_of_odom(
     for covariance in (state.pose_covariance, state.twist_covariance):
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
         assert np.linalg.eigvalsh(covariance).min() > 0.0
+
+
+def test_measured_pose_is_in_the_frame_of_the_image(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    for k in range(5):
+        r.odom(k / 40)
+        r.image(k / 40, image if k < 3 else EMPTY, header=Header(
+            frame_id='optical', stamp=nanoseconds_to_stamp(START + round(k / 40 * 1e9))))
+    assert len(r.frames) == 5
+    poses = [from_pose(message) for message in r.sent['neighbors/leader/pose']]
+    # None is repeated while the neighbor is out of sight.
+    assert [pose.stamp - START for pose in poses] == [0, 25_000_000, 50_000_000]
+    true = camera_mounting([0.1, 0.0, 0.0], RPY['front']).inverse() @ AHEAD
+    assert poses[-1].frame == 'optical' and poses[-1].covariance is not None
+    np.testing.assert_allclose(poses[-1].position, true.translation, atol=0.02)
+    np.testing.assert_allclose(
+        quaternion_to_matrix(poses[-1].quaternion), true.rotation, atol=0.06)
+    assert np.linalg.eigvalsh(poses[-1].covariance).min() > 0.0
     assert r.counters == {} and r.problems() == ''
 
 

@@ -47,7 +47,7 @@ import ctypes
 import sys
 sys.argv = ['planner']  # a program, by that name
 from flock_follower.nodes.planner import Planner
-from flock_follower.nodes.support.runtime import run, spin
+from flock_follower.nodes.support.process import run, spin
 
 class Stuck(Planner):
     def destroy_node(self):

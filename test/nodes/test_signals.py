@@ -37,7 +37,7 @@ from flock_desk.program import PROGRAMS
 from flock_desk.runs.processes import free_udp_port, private_environment, Processes, wait_until
 from flock_follower import signals
 from flock_follower.files import resource
-from flock_follower.nodes.support.runtime import unwritable_logs
+from flock_follower.nodes.support.process import unwritable_logs
 
 pytestmark = pytest.mark.usefixtures('default_hangup')
 #: Instead of the library that a program imports first: sends it a signal, and waits for the end.
@@ -56,7 +56,7 @@ NODES = {
     'relative_pose': ['--ros-args', '-p', 'image_transport:=compressed'], 'planner': [],
     'flock': ['--ros-args', '-p', 'vehicle_name:=one'],
     'replay': [str(resource('bags/sample')), '--ros-args', '-p', 'loop:=true'],
-    'visualizer': [], 'black_box': [],
+    'visualizer': [], 'black_box': [], 'view': ['--ros-args', '-p', 'port:=0'],
     'simulator': ['--ros-args', '-p', f'connection:=127.0.0.1:{free_udp_port()}']}
 
 

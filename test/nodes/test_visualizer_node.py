@@ -32,14 +32,13 @@ from flock_follower.command_messages import Command, trajectory
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_to_matrix
 from flock_follower.messages import to_array
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
-from flock_follower.nodes.visualizer import (
+from flock_follower.nodes.visualizer import Visualizer
+from flock_follower.view.scene import (
     ACCELERATION_SCALE,
-    COMMAND,
-    DEGENERATE,
+    COLORS,
     DEVIATIONS,
     ellipsoid,
-    GUARDED,
-    Visualizer,
+    MIN_LENGTH,
 )
 
 LEADER, OTHER, OWN = (2.0, 0.0, 1.5), (3.0, 1.0, 1.5), (0.0, 0.0, 1.5)
@@ -115,11 +114,11 @@ def test_it_draws_each_vehicle_where_it_is_and_the_band_of_the_one_in_the_graph(
     ('cohesion', 'leader farthest_m', 'leader nearest_m')])
 def test_the_bound_that_the_guard_holds_is_thick(
         rig: Rig, limits: str, thick: str, thin: str) -> None:
-    assert rig.draw()['command'].color.r == pytest.approx(COMMAND[0])
+    assert rig.draw()['command'].color.r == pytest.approx(COLORS['command'][0])
     rig.report('one', state='HOLD', reason='why', edges='leader', limits=limits)
     drawn = rig.draw()
     assert drawn[thick].scale.x > 2.0 * drawn[thin].scale.x
-    assert drawn['command'].color.r == pytest.approx(GUARDED[0])
+    assert drawn['command'].color.r == pytest.approx(COLORS['guarded'][0])
     assert drawn['state'].text == f'HOLD\nguard: {limits.split(", ")[-1]}\nwhy'
 
 
@@ -147,7 +146,6 @@ def test_without_a_viewer_odometry_that_waits_is_no_silence(ros: None) -> None:
 def test_an_ellipsoid_has_the_covariance_it_is_made_of(values: list[float]) -> None:
     root = np.reshape(values, (3, 3))
     shape = ellipsoid('x', np.zeros(3), root @ root.T)
-    turn = shape.pose.orientation
-    axes = quaternion_to_matrix([turn.x, turn.y, turn.z, turn.w])
-    again = axes @ np.diag(np.square(to_array(shape.scale) / (2.0 * DEVIATIONS))) @ axes.T
-    np.testing.assert_allclose(again, root @ root.T, atol=max(DEGENERATE**2, 1e-6))
+    axes = quaternion_to_matrix(shape.quaternion)
+    again = axes @ np.diag(np.square(np.array(shape.size) / (2.0 * DEVIATIONS))) @ axes.T
+    np.testing.assert_allclose(again, root @ root.T, atol=max(MIN_LENGTH**2, 1e-6))

@@ -51,8 +51,8 @@ def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) 
                               LEADER.markers if thorough else None)
     assert found.ids.tolist() == [3]
     errors = found.corners[0] - corners_of(camera, pose)
-    assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.5)
-    assert np.abs(errors.mean(axis=0)).max() < (0.35 if width < search.LARGE else 0.7)
+    assert np.abs(errors).max() < (1.0 if width < search.LARGE_WIDTH else 2.5)
+    assert np.abs(errors.mean(axis=0)).max() < (0.35 if width < search.LARGE_WIDTH else 0.7)
 
 
 @pytest.mark.parametrize('hidden', [(20, 20, 18), (110, 110, 20), (65, 20, 15)])

@@ -155,7 +155,7 @@ def test_whole_images_are_searched_in_portions_at_a_limited_rate(
     monkeypatch.setattr(search, 'portion', watched)
     stages = [drone.see(EMPTY).stage for _ in range(21)]
     assert stages == ['track' if k % every else 'full' for k in range(21)]
-    assert [number for _, number in done] == [k % search.PORTIONS for k in range(len(done))]
+    assert [number for _, number in done] == [k % search.N_PORTIONS for k in range(len(done))]
     stamps = [stamp for stamp, _ in done]
     assert {stamps.count(stamp) for stamp in stamps[1:]} == {most}
 

@@ -32,7 +32,7 @@ from flock_follower.bridge_state import (
     INACTIVE,
     NO_AUTOPILOT,
     parse,
-    SILENCE,
+    SILENCE_MAX,
 )
 from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
@@ -80,7 +80,7 @@ def test_any_text_is_read_as_one_of_the_words(text: str) -> None:
 
 @pytest.mark.parametrize(('reported', 'age', 'name'), [
     (None, 0.0, NO_AUTOPILOT), (None, math.inf, NO_AUTOPILOT),
-    (BridgeState(ACTIVE), 0.0, ACTIVE), (BridgeState(ACTIVE), SILENCE, ACTIVE),
+    (BridgeState(ACTIVE), 0.0, ACTIVE), (BridgeState(ACTIVE), SILENCE_MAX, ACTIVE),
     (BridgeState(ACTIVE), 1.001, NO_AUTOPILOT), (BridgeState(ACTIVE), math.inf, NO_AUTOPILOT),
     (BridgeState(ACTIVE), math.nan, NO_AUTOPILOT),
     (BridgeState('READY', 'x'), 0.5, 'READY'), (BridgeState('READY', 'x'), 1.5, NO_AUTOPILOT)])
@@ -282,11 +282,11 @@ def test_no_command_comes_unless_engaged_and_active_and_fresh(
         else:
             silent += 0.1
             decision, command = flight.tick(receives=False)
-            active = engaged and name == 'ACTIVE' and silent <= SILENCE
+            active = engaged and name == 'ACTIVE' and silent <= SILENCE_MAX
             assert (command is not None) == active == (decision.state is not State.IDLE)
             if active and anew:
                 assert flight.held == flight.height
             anew = False
-        if not (engaged and name == 'ACTIVE' and silent <= SILENCE):
+        if not (engaged and name == 'ACTIVE' and silent <= SILENCE_MAX):
             anew = True
             flight.height += 0.01

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+import math
 
 from flown import Follower, PARAMS, seen
 import numpy as np
@@ -81,3 +82,20 @@ def test_one_lost_behind_a_follower_in_sight_pushes_nobody_back() -> None:
         alone.tick(seen(alone.now, (2.4, 0.0, 2.0), name='ahead'))
         both.tick(seen(both.now, (2.4, 0.0, 2.0), name='ahead'), *glimpse)
     assert both.position == pytest.approx(alone.position, abs=0.05)
+
+
+@pytest.mark.parametrize('start', [(4.4, 2.2), (4.9, 0.0)], ids=['beside', 'behind'])
+def test_one_lost_that_comes_is_kept_clear_of_beside_another_in_sight(
+        start: tuple[float, float]) -> None:
+    """One in sight that is nearer to both hides a vehicle only on the line of sight to it."""
+    vehicles = {'ahead': Member(FOLLOWER), 'leader': Member(LEADER)}
+    params = replace(PARAMS, v_max=COLUMN_V_MAX, vehicles=vehicles)
+    follower, least = Follower(params, LAG), math.inf
+    place = np.array([*start, 2.0])
+    velocity = -0.9 * np.array([*start, 0.0]) / math.hypot(*start)
+    for tick in range(40):
+        leader = [seen(follower.now, place, velocity, 'leader')] if tick < 22 else []
+        follower.tick(seen(follower.now, (2.5, 0.0, 2.0), name='ahead'), *leader)
+        place = place + 0.1 * velocity
+        least = min(least, math.dist(place, follower.position))
+    assert least >= 2.0

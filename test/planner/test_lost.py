@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
+from typing import Any
 
 from flown import commanded, Follower, own, PARAMS, seen
 import numpy as np
@@ -181,3 +183,22 @@ def test_one_that_returns_too_near_is_not_faded_in() -> None:
         follower.now, follower.position + 0.4 * AHEAD, (-0.3, 0.0, 0.0)))
     assert commanded(decision)[0] < -1.0
     assert math.hypot(*commanded(decision)) <= PARAMS.a_max
+
+
+@pytest.mark.parametrize(('velocity', 'acceleration', 'changes', 'retreat'), [
+    ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {}, (-0.3, 0.0, 0.0)),
+    ((0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {}, None),  # it goes away
+    ((0.3, 0.0, 0.0), (-0.7, 0.0, 0.0), {}, (-0.4, 0.0, 0.0)),  # it turns back
+    ((-2.0, 0.0, 0.0), (0.0, 0.0, 0.0), {}, (-0.5, 0.0, 0.0)),  # at most v_max
+    ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'retreat_max': 0.0}, None),
+    ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'retreat_max': 0.15}, (-0.25, 0.0, 0.0)),
+    ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'guard': False}, None)])
+def test_it_names_the_velocity_that_keeps_the_distance_if_odometry_is_lost(
+        velocity: tuple[float, ...], acceleration: tuple[float, ...], changes: dict[str, Any],
+        retreat: tuple[float, ...] | None) -> None:
+    decision = Follower(replace(PARAMS, **changes)).tick(
+        seen(0.0, (2.4, 0.0, 2.0), velocity, acceleration=np.array(acceleration)))
+    if retreat is None:
+        assert decision.retreat is None
+    else:
+        assert decision.retreat == pytest.approx(retreat, abs=0.01)

@@ -95,6 +95,14 @@ def test_the_only_leader_in_sight_keeps_its_edge_whatever_is_received() -> None:
     assert edges(set(), own(), [leader, between, other], PARAMS) == {'follower_2', 'follower_3'}
 
 
+@pytest.mark.parametrize(('distance', 'held', 'kept'), [
+    (2.8, 'between', True), (2.9, 'between', False), (2.9, 'leader', True)])
+def test_beyond_the_band_no_edge_to_the_only_leader_in_sight_begins(
+        distance: float, held: str, kept: bool) -> None:
+    flock = [at('between', 0.5 * distance, 0.0, 0.0, received=True), at('leader', distance, 0, 0)]
+    assert ('leader' in edges({held}, own(), flock, PARAMS)) is kept
+
+
 def test_one_to_avoid_has_no_edge_and_removes_none() -> None:
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
     assert edges(set(), own(), flock, PARAMS) == {'leader'}

@@ -70,6 +70,13 @@ def test_the_angles_are_those_of_the_image() -> None:
     assert (VIEW.left, VIEW.right, VIEW.up, VIEW.down) == pytest.approx((aside, aside, up, up))
 
 
+def test_a_neighbor_without_a_marker_has_no_marker_angle() -> None:
+    it = expected(np.array([2.0, 0.0, 0.0]))
+    arguments = it.position, np.zeros(3), it, 1.0
+    assert marker_bounds(*arguments, Member(LEADER, 0.0, (math.pi,)), PARAMS)
+    assert marker_bounds(*arguments, Member(LEADER, 0.0, ()), PARAMS) == []
+
+
 @pytest.mark.parametrize('several', [False, True])
 def test_a_fisheye_sees_as_far_as_its_model_says(several: bool) -> None:
     narrow = FieldOfView.of_camera(

@@ -31,6 +31,7 @@ from flock_desk.runs.flight import (
     own,
     parameters_of_nodes,
     spacing,
+    start_view,
 )
 from flock_desk.runs.judge import flat, judge
 from flock_desk.runs.processes import LateError, Processes
@@ -426,3 +427,18 @@ def test_a_flight_that_never_began_is_an_error(tmp_path):
     np.savez(tmp_path / 'flight.npz', began=np.nan, ended=np.nan)
     with pytest.raises(RuntimeError, match='never began'):
         read_flown(load('indoor'), Path(tmp_path))
+
+
+@pytest.mark.parametrize(('variable', 'starts'), [('no', False), ('yes', True), ('', True)])
+def test_a_flight_starts_the_live_page_unless_view_is_no(monkeypatch, variable, starts):
+    started = []
+
+    class Group:
+        def start(self, *arguments, **options):
+            started.append((arguments, options))
+
+    monkeypatch.setenv('VIEW', variable)
+    start_view(Group(), 'one')
+    arguments = ['--ros-args', '-r', '__ns:=/one']
+    assert started == [(('view', 'flock_follower.nodes.view', arguments),
+                        {'show': True, 'ends': True})][:starts]

@@ -230,3 +230,29 @@ def test_apriltags_are_printed_with_the_way_up_of_others(
     for dictionary, noted in (('DICT_APRILTAG_36h11', True), ('DICT_4X4_50', False)):
         assert main(['--dictionary', dictionary, '--output', str(tmp_path / 'marker.pdf')]) == 0
         assert (APRILTAG_NOTE in capsys.readouterr().err) is noted
+
+
+@pytest.mark.parametrize(('dictionary', 'pixels'), [
+    ('DICT_4X4_50', 400), ('DICT_APRILTAG_36h11', 200)])
+def test_a_texture_is_detected_upright(tmp_path: Path, dictionary: str, pixels: int) -> None:
+    path = tmp_path / 'tag.png'
+    assert main(['--id', '3', '--dictionary', dictionary, '--output', str(path),
+                 '--pixels', str(pixels)]) == 0
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image.shape == (pixels, pixels) and set(np.unique(image)) == {0, 255}
+    found = detect(np.pad(image, 50, constant_values=255), dictionary)
+    assert found.ids.tolist() == [3]
+    cell = pixels / (marker_cells(dictionary) + 2)
+    np.testing.assert_allclose(found.corners[0][0], [49.5 + cell] * 2, atol=1.5)
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['--output', 'x.png', '--pixels', '100'], '8 cells'),
+    (['--output', 'x.png', '--pixels', '0'], '8 cells'),
+    (['--output', 'x.png', '--id', '0', '1'], 'a .png has one marker'),
+    (['--output', 'x.png', '--id', '50'], '--id = 50'),
+    (['--output', 'x.pdf', '--pixels', '80'], '--pixels = 80: only')])
+def test_a_texture_that_cannot_be_is_refused(
+        arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err

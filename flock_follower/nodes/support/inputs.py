@@ -34,7 +34,7 @@ from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.parameters.spec import filled
 
 BASE = 'base_link'
-LARGEST = 65536  # bytes of a message on /tf_static: about 500 transforms
+TRANSFORMS_BYTES_MAX = 65536  # bytes of a message on /tf_static: about 500 transforms
 #: Reliable, and the last message is kept for subscribers that start later. Never KEEP_ALL: a
 #: stopped subscriber would block the publisher.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -61,12 +61,12 @@ class StaticChild:
     """The frames of ``/tf_static``; none if tf2_msgs is not installed, as in the PyPI runtime."""
 
     def __init__(self, node: Node) -> None:
-        self._frames = StaticFrames()
+        self.frames = StaticFrames()
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
             return
-        subscribe = (partial(node.subscribe, required=False, largest=LARGEST)
+        subscribe = (partial(node.subscribe, required=False, largest=TRANSFORMS_BYTES_MAX)
                      if isinstance(node, FlockNode) else node.create_subscription)
         subscribe(TFMessage, '/tf_static', self.take, QoSProfile(
             depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -75,13 +75,13 @@ class StaticChild:
         """Take a TFMessage."""
         for stamped in message.transforms:
             turn = stamped.transform.rotation
-            self._frames.add(
+            self.frames.add(
                 stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
                     to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
 
     def transform(self, child: str) -> Transform | None:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""
-        return None if child in ('', BASE) else self._frames.pose(child, BASE)
+        return None if child in ('', BASE) else self.frames.pose(child, BASE)
 
 
 class OwnOdometry:

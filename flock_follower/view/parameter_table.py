@@ -12,19 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Keys of the diagnostics of the bridge, which writes them and ``check`` reads."""
+"""The parameters of view."""
 
 from __future__ import annotations
 
 from typing import Final
 
-PARAMETER: Final = 'parameter '
-MISSING: Final = 'missing parameter '
-UNPROVEN: Final = 'unproven firmware'
-NOT_READY: Final = 'not ready to arm'
-UNREAD: Final = 'parameters unread'
-#: That the autopilot answers nothing, or ''; the questions that have no answer.
-NO_ANSWERS: Final = 'no answers'
-UNANSWERED: Final = 'unanswered questions'
-REFUSED: Final = 'offboard would be refused'
-LINK_FAULT: Final = 'link fault'
+from flock_follower.parameters.spec import Spec
+from flock_follower.ranges import Range
+
+VIEW: Final = [
+    Spec('host', '127.0.0.1',
+         'address to serve the page on; beyond loopback (0.0.0.0: all interfaces) a token is '
+         'needed for reading, too: an ssh tunnel to 127.0.0.1 is safer'),
+    Spec('port', 8090, 'TCP port of the page; 0: any that is free', Range(0, 65535)),
+    Spec('control', False,
+         'true: the page has the buttons Brake (planner/engage false) and Land '
+         '(mavlink_bridge/land), for the address with the token that the node prints'),
+]

@@ -1,0 +1,172 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The vehicle's motion by odometry and by the autopilot, as the gate receives it.
+
+``MotionSources`` stores the newest motion of both, chooses the source that commands are checked
+against, and compares the two: see ``velocity_check``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.obstacle import Obstacle, Refusal
+from flock_follower.gate.velocity_check import (
+    AUTOPILOT,
+    displaced,
+    DISPLACED_HANDOVER_TIME,
+    finite_vector,
+    known_motion,
+    KnownMotion,
+    MotionReport,
+    ODOM,
+    Path,
+    plausible_velocity,
+    refusal,
+    Source,
+    VelocityComparison,
+)
+from flock_follower.geometry import Array
+
+VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
+
+
+def onset(since: float, holds: bool, now: float) -> float:
+    """Return the time from which a condition holds, s; infinite while it does not."""
+    return min(since, now) if holds else math.inf
+
+
+class MotionSources:
+    """
+    The newest motion by both sources; times are monotonic, s.
+
+    :param choice: the source that commands are checked against, one of ``VELOCITY_SOURCES``;
+        'auto' is odom once odom was received.
+    """
+
+    def __init__(self, choice: str) -> None:
+        self.displaced: Refusal | None = None
+        """That the displacements of the sources differ, if they do."""
+        self._choice = choice
+        self._sources = {ODOM: Source(), AUTOPILOT: Source()}
+        self._height_path = Path()
+        self._comparison = VelocityComparison()
+        self._distrusted_since = math.inf
+        self._displaced_since = math.inf
+
+    @property
+    def source(self) -> str:
+        """Return the source that commands are checked against now."""
+        if self._choice in (ODOM, AUTOPILOT):
+            return self._choice
+        # Once odometry was received, losing it must brake: the autopilot's own estimate often
+        # rests on that odometry, and drifts meters without it.
+        return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
+
+    @property
+    def odometry(self) -> Source:
+        """Return the motion by odometry."""
+        return self._sources[ODOM]
+
+    @property
+    def position(self) -> Array | None:
+        """Return the position (3,), m, by the source, without its jumps; None if unknown."""
+        return self._sources[self.source].path.position
+
+    def take(self, source: str, report: MotionReport, age: float, max_age: float,
+             now: float) -> str:
+        """Take a report of an age, s, at most ``max_age``; return '' or why it is refused."""
+        v, known = plausible_velocity(report.velocity), self._sources[source]
+        if v is None:
+            return 'not finite' if finite_vector(report.velocity) is None else 'too fast'
+        if not (refused := refusal(age, max_age)):
+            time = now - max(age, 0.0)
+            known.take_velocity(v, time)
+            known.take_yaw(report.yaw, time)
+            known.take_position(report.position, time, report.std, max_age)
+        return refused
+
+    def take_position(self, source: str, position: ArrayLike, time: float,
+                      max_age: float) -> None:
+        """Take a position (3,), m, at a time, s; ``max_age`` of a velocity to compare it, s."""
+        self._sources[source].take_position(position, time, 0.0, max_age)
+
+    def take_yaw(self, source: str, yaw: float, time: float) -> None:
+        """Take the vehicle's yaw, rad, ENU, at a time, s."""
+        self._sources[source].take_yaw(yaw, time)
+
+    def take_height(self, height: float, now: float) -> None:
+        """Take a height by the barometer, m."""
+        self._height_path.take(np.array([0.0, 0.0, height]), None, now)
+
+    def fresh_yaw(self, max_age: float, now: float) -> float | None:
+        """Return the yaw, rad, the autopilot's first: it obeys in its own frame; else None."""
+        yaws = [self._sources[source].yaw() for source in (AUTOPILOT, ODOM)]
+        return next((yaw for yaw, time in yaws if now - time <= max_age), None)
+
+    def known_motion(self, limits: GateLimits, now: float) -> KnownMotion:
+        """Return what is known of the motion at ``now``, s."""
+        odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
+        _, yaw_time = odom.yaw()
+        # Compared at the same time: at 1 rad/s odometry 0.25 s late would differ by 0.25 rad.
+        return known_motion(
+            limits, odom.motion(now), autopilot.motion(now, yaw_time), source=self.source,
+            disagreeing_for=self._comparison.disagreeing_for(now),
+            distrusted_for=now - self._distrusted_since)
+
+    def compare(self, limits: GateLimits, engaged: bool, distrusted: bool, fused: bool,
+                now: float) -> KnownMotion:
+        """
+        Compare the velocities and displacements; return what is known after that.
+
+        :param engaged: whether the vehicle flies by them.
+        :param distrusted: whether the velocity of the autopilot is invalid.
+        :param fused: whether the autopilot's estimate rests on our odometry.
+        """
+        self._distrusted_since = onset(self._distrusted_since, distrusted, now)
+        known, before = self.known_motion(limits, now), self._comparison.disagreeing_for(now)
+        self._comparison.take(known.difference, limits.velocity_tolerance, engaged, now)
+        # An estimate that rests on our odometry, or on no sensor, is no evidence.
+        proves = not fused and not distrusted
+        self.displaced = None if known.source != ODOM else displaced(
+            self._sources[ODOM], self._sources[AUTOPILOT] if proves else None,
+            known.turned or 0.0, self._height_path, now)
+        self._displaced_since = onset(
+            self._displaced_since, engaged and self.displaced is not None, now)
+        return known if self._comparison.disagreeing_for(now) == before else (
+            self.known_motion(limits, now))
+
+    def displaced_too_long(self, now: float) -> bool:
+        """Return whether displacements have differed for so long that the vehicle must stop."""
+        return now - self._displaced_since > DISPLACED_HANDOVER_TIME
+
+    def contradiction(self, limits: GateLimits, now: float) -> str:
+        """Return the contradiction between odom and the autopilot as text, or ''."""
+        known = self.known_motion(limits, now)
+        cause, turned = known.contradiction, math.degrees(known.turned or 0.0)
+        if cause is Obstacle.YAWS_DISAGREE:
+            return (f'{cause.value} by {turned:.0f} deg: their frames are not aligned, commands '
+                    'would go the wrong way')
+        if cause is Obstacle.VELOCITIES_DISAGREE:
+            return (f'{cause.value} by {self._comparison.difference:.2f} m/s, more than '
+                    f'{limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
+        # Displacements are compared in each cycle.
+        return '' if self.displaced is None else str(self.displaced)

@@ -1,0 +1,145 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The situation of one decision: all that ``setpoint_rules.decide`` may know, as one value.
+
+The gate collects its inputs into a ``Situation``, and ``decide`` turns it into a setpoint.
+``to_json`` writes it as one line, ``from_json`` reads it: a decision can be made again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+import enum
+import json
+import math
+from typing import Any, get_args, get_type_hints, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.command_messages import Command
+from flock_follower.gate.envelope import GateLimits, Location
+from flock_follower.gate.obstacle import Refusal
+from flock_follower.gate.relative_flight import Relative
+from flock_follower.gate.velocity_check import KnownMotion
+
+
+class AcceptedCommand(NamedTuple):
+    """A command that was accepted; times are on the monotonic clock."""
+
+    command: Command
+    time: float
+    """When it applies, s."""
+    source_time: float
+    """When the image it rests on was taken, s."""
+
+
+class Held(NamedTuple):
+    """Yaw and height to keep without a command; None if unknown."""
+
+    yaw: float | None = None
+    """rad."""
+    height: float | None = None
+    """m."""
+
+
+class Report(NamedTuple):
+    """What the autopilot reports of the vehicle, and how old that is."""
+
+    armed: bool
+    """Whether it is armed; before, setpoints are level."""
+    airborne: bool
+    """Whether it flies: on the ground PX4 takes any upward acceleration as a request to take
+    off."""
+    link_age: float
+    """Time since the autopilot is missing, s."""
+    mode_age: float
+    """Time since a message last had the mode, s: the pilot may have switched since."""
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What is known at ``now``, s on the monotonic clock; vectors are ENU."""
+
+    now: float
+    limits: GateLimits
+    """Those of commands; they may be lower than at start."""
+    start_limits: GateLimits
+    """Those at start, for braking and separation."""
+    known: KnownMotion
+    """The vehicle's motion, as far as it is known."""
+    report: Report
+    command: AcceptedCommand | None
+    """The newest command."""
+    withheld: str
+    """Why nothing may be sent at all, such as a pilot who has taken over; '' permits."""
+    unplaced: Refusal | None
+    """Why a place that was known is not usable now."""
+    place: Location
+    """The vehicle's location in its envelope."""
+    held: Held
+    relative: Relative
+    """Whether a command may rest on the marker alone."""
+    offset: ArrayLike
+    """The acceleration (3,), m/s^2, that offsets the disturbance."""
+    retreat: ArrayLike | None = None
+    """Velocity (3,), m/s, to brake to, as odometry is lost; None: to a hover."""
+
+    @property
+    def command_age(self) -> float:
+        """Return the time since the command applied, s; infinite without one."""
+        return math.inf if self.command is None else self.now - self.command.time
+
+    @property
+    def source_age(self) -> float:
+        """Return the age of the image that the command rests on, s; infinite without one."""
+        return math.inf if self.command is None else self.now - self.command.source_time
+
+    def to_json(self) -> str:
+        """Return the situation as one line of JSON, with NaN and Infinity as in Python."""
+        return json.dumps(_plain_value(self))
+
+    @classmethod
+    def from_json(cls, line: str) -> Situation:
+        """Return the situation of a line of ``to_json``; equal bit for bit, arrays as arrays."""
+        situation: Situation = _read_value(cls, json.loads(line))
+        return situation
+
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, enum.Enum):
+        return value.name
+    if is_dataclass(value) or hasattr(value, '_fields'):
+        return {name: _plain_value(getattr(value, name)) for name in _names(type(value))}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _names(kind: Any) -> Iterator[str]:
+    return (field.name for field in fields(kind)) if is_dataclass(kind) else iter(kind._fields)
+
+
+def _read_value(hint: Any, plain: Any) -> Any:
+    """Return a value of a type, or of one type of a union, from its ``_plain_value``."""
+    kinds = get_args(hint) or (hint,)
+    if isinstance(plain, Mapping):
+        kind = next(kind for kind in kinds if is_dataclass(kind) or hasattr(kind, '_fields'))
+        hints = get_type_hints(kind)
+        return kind(**{name: _read_value(hints[name], each) for name, each in plain.items()})
+    if isinstance(plain, str) and (
+            kind := next((k for k in kinds if isinstance(k, enum.EnumMeta)), None)):
+        return kind[plain]
+    return np.array(plain) if isinstance(plain, list) else plain

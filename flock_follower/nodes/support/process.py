@@ -1,0 +1,153 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The process of one node: its start, spin, end by a signal, and exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import gc
+import itertools
+import os
+from pathlib import Path
+import sys
+import tempfile
+from typing import Any
+
+import rclpy
+from rclpy.exceptions import NameValidationException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.node import Node
+
+from flock_follower.files import read_text
+from flock_follower.nodes import ignore_signals, on_signal, set_deadline
+from flock_follower.nodes.support.parameters import usage
+from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.parameters.sections import files_in
+
+LOGGER = 'flock_follower'  # of lines before a node has its name
+
+
+def spin(node: Node) -> None:
+    """Spin a node in an executor of its own until it is shut down."""
+    if not node.context.ok():
+        return
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # During a shutdown rclpy raises from any place.
+        if node.context.ok():
+            raise
+    finally:
+        executor.shutdown(timeout_sec=0.5)
+
+
+def run(factory: Callable[[], Node], args: list[str] | None = None,
+        spin: Callable[[Any], int | None] = spin) -> int:
+    """
+    Run one node until Ctrl-C, SIGTERM, SIGHUP or its own end; return the process's exit code.
+
+    ``factory`` creates the node; a ValueError or OSError it raises (a bad parameter, a missing
+    file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
+    ``args`` None: the arguments of the process. With ``--help`` it prints the help and ends.
+    """
+    arguments = sys.argv[1:] if args is None else args
+    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
+    if '-h' in own or '--help' in own:
+        print(usage(sys.modules[factory.__module__]))
+        return 0
+    # ROS ignores such an argument: the parameter that it sets would keep its default.
+    if stray := next((argument for argument in own
+                      if argument.startswith('-') or ':=' in argument), ''):
+        print(f'error: {stray}: must come after --ros-args, as --ros-args -p v_max:=1.0',
+              file=sys.stderr)
+        return 1
+    try:  # rclpy names neither the cause nor, for a folder, the file
+        for path in files_in(arguments):
+            read_text(path)
+    except (OSError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    node: Node | None = None
+    code: int | None = 0
+    try:
+        try:
+            _start_ros(sys.argv if args is None else args)
+        except RuntimeError as error:  # malformed --ros-args
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+            return 1
+        FlockNode.parameter_files = files_in(arguments)
+        try:
+            node = factory()
+        except (ValueError, OSError, NameValidationException) as error:
+            if not rclpy.ok():
+                return 0  # it failed because it was interrupted
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+            return 1
+        # The objects made so far stay: to scan them for garbage would be a pause in flight.
+        gc.freeze()
+        code = spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # During a shutdown rclpy raises from any place.
+        if rclpy.ok():
+            raise
+    finally:
+        set_deadline()
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        ignore_signals()
+    return code or 0
+
+
+def _start_ros(arguments: Sequence[str]) -> None:
+    """
+    Start ROS, and have the signals that end this process shut it down.
+
+    :raises RuntimeError: malformed ``--ros-args``.
+    """
+    # A node without a log flies better than none.
+    reason = unwritable_logs(os.environ)
+    silent = ['--ros-args', '--disable-external-lib-logs', '--'] if reason else []
+    rclpy.init(args=[*silent, *arguments])
+    context = rclpy.get_default_context()
+    # From Kilted on a shutdown destroys the tracked nodes: in the handler of a signal, while the
+    # same thread may hold their locks, and nodes whose constructor raised. `run` destroys its own.
+    context.track_node = lambda node: None
+    on_signal(context.try_shutdown)
+    if reason:
+        get_logger(LOGGER).warning(f'logs go to the terminal alone: {reason}')
+
+
+def unwritable_logs(environment: Mapping[str, str]) -> str:
+    """Return why ROS, started with an environment, cannot write a log file; '' if it can."""
+    get, home = environment.get, environment.get('HOME', '')
+    name = get('ROS_LOG_DIR') or f'{get("ROS_HOME") or "~/.ros"}/log'
+    if name.startswith('~') and not home:
+        return f'{name}: HOME is not set'
+    folder = Path(home + name[1:] if name.startswith('~') else name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b'.')
+    except OSError as error:
+        return f'{folder}: {error.strerror}'
+    return ''

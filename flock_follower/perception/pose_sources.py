@@ -1,0 +1,259 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Poses of neighbors that other detectors measure: their checks, and their way into the tracker.
+
+A pose waits until odometry reaches its stamp, as an image does. It then enters the tracker at the
+place where the measurement of a marker does. The stamps of the images that the other detector
+processes (``frames_topic``) are passed on after the poses of these images: when a pose of that
+image or a later one was used, or when a pose of it would be late.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import deque
+from collections.abc import Iterator, Mapping
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array, normalize_quaternion, Transform
+from flock_follower.messages import FARTHEST, SANE
+from flock_follower.neighbors_file import PoseSource
+from flock_follower.odometry.buffer import Missing
+from flock_follower.odometry.static_frames import StaticFrames
+from flock_follower.perception.look import Sighting
+from flock_follower.perception.range_tracking import Rejection
+from flock_follower.perception.tracker import Tracker
+from flock_follower.pose_messages import PoseState
+
+#: A pose stamped up to this far ahead of the newest odometry, s, waits for it; beyond, clocks
+#: differ.
+AHEAD_OF_ODOMETRY = 0.3
+#: A pose older than the newest odometry by more, s, is of another clock, or of no use.
+OLDEST_POSE = 1.0
+#: s: a pose and a frame whose stamps differ by less are of one image.
+SAME_IMAGE = 1e-3
+MOST_WAITING = 100  # poses, and frames: a bound on memory
+LATENCIES = 50  # number of poses over which their latency is observed
+LATE_MARGIN = 0.03  # s beyond the longest latency, after which a frame has no pose
+#: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
+AXES_VARIANCE = 1e-4
+BASE = 'base_link'
+
+UNKNOWN_FRAME = 'pose in an unknown frame'
+UNTIMELY = 'pose stamp repeated, too old or ahead of the odometry'
+INVALID = 'pose not finite, or too far away'
+NO_ATTITUDE = 'pose with a zero quaternion'
+NO_COVARIANCE = 'pose without a covariance'
+INVALID_COVARIANCE = 'pose with an invalid covariance'
+TWO_PUBLISHERS = 'poses of one neighbor from several publishers'
+UNPLACED = 'pose without odometry'
+
+
+class Sourced(NamedTuple):
+    """The result of a pose: the neighbor's name, the stamp of the pose, ns, and the sighting."""
+
+    name: str
+    stamp: int
+    sighting: Sighting
+
+
+class _Waiting(NamedTuple):
+    """A pose that waits for odometry of its stamp, s, and when it came, s."""
+
+    stamp: float
+    name: str
+    state: PoseState
+    pose: Transform
+    covariance: Array
+    T_body_frame: Transform | None
+    received: float
+
+
+class _Frame(NamedTuple):
+    """The stamp of an image, s and ns, and when its message came, s."""
+
+    stamp: float
+    stamp_ns: int
+    received: float
+
+
+class PoseSources:
+    """
+    Takes poses and the stamps of frames; ``now`` is seconds on any clock that runs evenly.
+
+    ``frames`` has the optical frames of the own cameras on the body, ``static`` those of
+    ``/tf_static``.
+
+    :param max_wait: the longest time for which a frame waits for its pose, s.
+    """
+
+    def __init__(self, tracker: Tracker, max_wait: float) -> None:
+        config = tracker.config
+        self.sources: Mapping[str, PoseSource] = {
+            n.name: n.source for n in config.neighbors if n.source is not None}
+        self.frames: dict[str, Transform] = {}
+        self.static = StaticFrames()
+        self._tracker, self._max_wait = tracker, max_wait
+        self._with_frames = bool(config.frames_topic)
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all that waits."""
+        self._newest = dict.fromkeys(self.sources, -math.inf)
+        self._poses: list[_Waiting] = []
+        self._frames: deque[_Frame] = deque(maxlen=MOST_WAITING)
+        self._shown = self._reached = -math.inf  # stamps of the newest frame, and pose, used, s
+
+    @property
+    def has_waiting(self) -> bool:
+        """Return whether a pose or a frame waits."""
+        return bool(self._poses or self._frames)
+
+    def take(self, name: str, state: PoseState, stamp: float, now: float,
+             odom_frame: str) -> Rejection | None:
+        """
+        Take a neighbor's pose, to be used by :meth:`due`; return why it is dropped, or None.
+
+        :param stamp: its stamp, s, by the clock of the odometry.
+        :param odom_frame: the frame of the odometry; '' if it is unknown.
+        """
+        source, newest = self.sources[name], self._tracker.newest_odometry
+        if newest is None or not odom_frame:
+            return UNPLACED, name
+        if not max(newest - OLDEST_POSE, self._newest[name]) < stamp <= newest + AHEAD_OF_ODOMETRY:
+            return UNTIMELY, f'{name}: {stamp - newest:.2f} s after the odometry'
+        frame = state.frame.lstrip('/')
+        T_body_frame = self._mounting(frame)
+        if T_body_frame is None and frame != odom_frame.lstrip('/'):
+            return UNKNOWN_FRAME, (
+                f'{name}: frame {frame!r}: must be {odom_frame}, {BASE}, a frame connected to it '
+                f'by tf_static, or of a camera: {", ".join(self.frames) or "no camera_info yet"}')
+        if not math.hypot(*state.position.tolist()) <= (
+                SANE if T_body_frame is None else FARTHEST):  # NaN fails
+            return INVALID, f'{name}: position {state.position.tolist()}'
+        checked = _attitude(source, state)
+        if isinstance(checked, str):
+            return checked, name
+        covariance = _covariance(source, state)
+        if isinstance(covariance, str):
+            return covariance, name
+        self._newest[name] = stamp
+        if len(self._poses) < MOST_WAITING:
+            insort(self._poses, _Waiting(
+                stamp, name, state, Transform.from_quaternion(state.position, checked),
+                covariance, T_body_frame, now), key=lambda waiting: waiting.stamp)
+        return None
+
+    def take_frame(self, stamp_ns: int, stamp: float, now: float) -> None:
+        """Take the stamp of an image that the other detector gets, in ns and s."""
+        if self._frames and stamp < self._frames[-1].stamp:
+            self._frames.clear()
+        self._frames.append(_Frame(stamp, stamp_ns, now))
+
+    def due(self, now: float) -> Iterator[Sourced | Rejection | int]:
+        """Use every pose that odometry has reached; yield the results, and stamps of frames."""
+        while self._poses:
+            each = self._poses[0]
+            missing = self._tracker.missing_odometry(each.stamp)
+            if missing is Missing.TOO_NEW and now - each.received < self._max_wait:
+                break
+            self._poses.pop(0)
+            if missing is not None:
+                yield UNPLACED, f'{each.name}: {missing.value}'
+                continue
+            self._observe_latency(each)
+            yield Sourced(each.name, each.state.stamp, self._process(each))
+            if not self._with_frames:
+                yield from self._show(each.stamp, each.state.stamp)
+        yield from self._due_frames(now)
+
+    def _process(self, each: _Waiting) -> Sighting:
+        pose, covariance, mounting = each.pose, each.covariance, each.T_body_frame
+        if self.sources[each.name].position_only:
+            turn = self._tracker.attitude(each.stamp)
+            if mounting is not None and turn is not None:  # the body has the axes of odom
+                pose = Transform((turn @ mounting.rotation).T, pose.translation)
+        return self._tracker.process_pose(each.stamp, each.name, pose, covariance, mounting)
+
+    def _mounting(self, frame: str) -> Transform | None:
+        if frame == BASE:
+            return Transform()
+        known = self.frames.get(frame)
+        return known if known is not None else self.static.pose(frame, BASE)
+
+    def _observe_latency(self, each: _Waiting) -> None:
+        """Learn how long after its frame a pose comes; pass that frame and those before on."""
+        for frame in self._frames:
+            if abs(frame.stamp - each.stamp) < SAME_IMAGE:
+                self._latencies.append(max(each.received - frame.received, 0.0))
+        self._reached = each.stamp
+
+    def _due_frames(self, now: float) -> Iterator[int]:
+        wait = self._max_wait if not self._latencies else min(
+            max(self._latencies) + LATE_MARGIN, self._max_wait)
+        pending = [each.stamp for each in self._poses]
+        while self._frames:
+            frame = self._frames[0]
+            used = frame.stamp <= self._reached + SAME_IMAGE and not (
+                pending and pending[0] <= frame.stamp + SAME_IMAGE)
+            if not used and now - frame.received < wait:
+                return
+            self._frames.popleft()
+            yield from self._show(frame.stamp, frame.stamp_ns)
+
+    def _show(self, stamp: float, stamp_ns: int) -> Iterator[int]:
+        """Yield the stamp of a frame if it is newer than the last one."""
+        if stamp > self._shown:
+            self._shown = stamp
+            yield stamp_ns
+
+
+
+def _attitude(source: PoseSource, state: PoseState) -> Array | str:
+    """Return the attitude (x, y, z, w) of a pose, or why it is invalid."""
+    if source.position_only:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    if not state.quaternion.any():
+        return NO_ATTITUDE
+    try:
+        return normalize_quaternion(state.quaternion)
+    except ValueError:
+        return INVALID
+
+
+def _covariance(source: PoseSource, state: PoseState) -> Array | str:
+    """Return the covariance (6, 6) of a pose, or why there is none."""
+    given = state.covariance
+    rows = 3 if source.position_only else 6
+    if given is None or not given.any():
+        deviations = [source.position_std, AXES_VARIANCE**0.5 if source.position_only else
+                      source.attitude_std]
+        if None in deviations:
+            return NO_COVARIANCE
+        return np.diag(np.repeat(np.array(deviations, dtype=float), 3)**2)
+    used = given[:rows, :rows]
+    if not np.abs(used).max() <= SANE:  # NaN fails
+        return INVALID_COVARIANCE
+    used = 0.5 * (used + used.T)
+    if not np.linalg.eigvalsh(used)[0] > 0.0:
+        return INVALID_COVARIANCE
+    covariance = AXES_VARIANCE * np.eye(6)
+    covariance[:rows, :rows] = used
+    return covariance

@@ -1,0 +1,131 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Conversion of poses of neighbors to messages of other packages and back; see ``messages``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import struct
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array, canonical_quaternion, Transform
+from flock_follower.messages import (
+    Make,
+    ODOMETRY,
+    read_stamp,
+    set_quaternion,
+    set_stamp,
+    set_vector,
+    to_array,
+)
+
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+#: Types of the poses of other detectors, the best first.
+POSE_TYPES = (POSE, 'geometry_msgs/msg/PoseStamped', ODOMETRY)
+TRANSFORM = 'geometry_msgs/msg/TransformStamped'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+
+
+def pose_topic(name: str) -> str:
+    """Return the topic of the measured poses of a neighbor."""
+    return f'neighbors/{name}/pose'
+
+
+def child_frame(name: str, namespace: str) -> str:
+    """Return the frame of a neighbor on /tf."""
+    return '/'.join(filter(None, [namespace.strip('/'), name]))
+
+
+def pose_with_covariance(make: Make, stamp: int, frame: str, pose: Transform,
+                         covariance: Array) -> Any:
+    """
+    Return a PoseWithCovarianceStamped of a stamp, ns, in a frame.
+
+    ``covariance`` (6, 6): position, m, then rotation vector, rad, both along the frame's axes.
+    """
+    message = make(POSE)
+    set_stamp(message.header.stamp, stamp)
+    message.header.frame_id = frame
+    set_vector(message.pose.pose.position, pose.translation)
+    set_quaternion(message.pose.pose.orientation, canonical_quaternion(pose.quaternion))
+    message.pose.covariance = np.asarray(covariance, dtype=float).reshape(36)
+    return message
+
+
+def transforms(make: Make, states: Iterable[Any], namespace: str = '') -> Any:
+    """
+    Return the TFMessage of Odometry messages: each pose as that of its child frame.
+
+    :param namespace: precedes the name of each child frame.
+    """
+    message = make(TRANSFORMS)
+    for state in states:
+        stamped, pose = make(TRANSFORM), state.pose.pose
+        stamped.header.stamp = state.header.stamp
+        stamped.header.frame_id = state.header.frame_id
+        stamped.child_frame_id = child_frame(state.child_frame_id, namespace)
+        set_vector(stamped.transform.translation, to_array(pose.position))
+        turn = pose.orientation
+        set_quaternion(stamped.transform.rotation, [turn.x, turn.y, turn.z, turn.w])
+        message.transforms.append(stamped)
+    return message
+
+
+class PoseState(NamedTuple):
+    """
+    The pose of a neighbor as another detector sends it, in ``frame``; nothing is checked.
+
+    ``stamp``, ns; ``position`` (3,), m; ``quaternion`` (x, y, z, w); ``covariance`` (6, 6) of
+    position, m, and rotation vector, rad, along the axes of ``frame``, None if the type has none.
+    """
+
+    stamp: int
+    frame: str
+    position: Array
+    quaternion: Array
+    covariance: Array | None = None
+
+
+def from_pose(message: Any) -> PoseState:
+    """
+    Return the pose of a PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.
+
+    :raises ValueError: if the stamp is invalid.
+    """
+    covariance = None
+    if hasattr(message, 'transform'):
+        place, turn = message.transform.translation, message.transform.rotation
+    else:
+        pose = message.pose
+        if hasattr(pose, 'covariance'):
+            covariance, pose = np.asarray(pose.covariance, dtype=float).reshape(6, 6), pose.pose
+        place, turn = pose.position, pose.orientation
+    return PoseState(read_stamp(message.header.stamp), message.header.frame_id, to_array(place),
+                     np.array([turn.x, turn.y, turn.z, turn.w]), covariance)
+
+def stamp_of(data: bytes) -> int:
+    """
+    Return the stamp, ns, of the bytes of a message that begins with a header.
+
+    :raises ValueError: if there is none.
+    """
+    try:
+        seconds, nanoseconds = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
+    except (struct.error, IndexError):
+        raise ValueError('a message without a header') from None
+    return read_stamp(SimpleNamespace(sec=seconds, nanosec=nanoseconds))
