@@ -69,14 +69,10 @@ def test_every_file_module_and_command_that_a_page_names_exists(page):
         assert service in SERVICES, service
 
 
-#: Pages with longer lines, until they are rewritten.
-LONG_LINES = {'guard.md', 'flocks.md', 'view.md', 'other_packages.md'}
-
-
 @pytest.mark.parametrize('path', sorted((ROOT / 'docs').glob('*.md')), ids=lambda path: path.stem)
 def test_lines_of_docs_have_at_most_140_characters(path):
     long = [n for n, line in enumerate(path.read_text().splitlines(), 1) if len(line) > 140]
-    assert path.name in LONG_LINES or not long, long[:5]
+    assert not long, long[:5]
 
 
 def test_every_answer_has_at_most_six_lines():
