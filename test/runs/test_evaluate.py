@@ -115,7 +115,8 @@ def test_the_summary_has_the_figures_others_rely_on(result: Path) -> None:
     assert sorted(p.name for p in result.iterdir()) == [
         'report.html', 'result.mcap', 'summary.json']
     with open_bag(result / 'result.mcap') as bag:
-        assert set(bag.topics) == {'/neighbors', '/neighbors/acceleration', '/planner/state',
+        assert set(bag.topics) == {'/neighbors', '/neighbors/acceleration',
+                                   '/neighbors/leader/pose', '/planner/state',
                                    '/command/trajectory', '/setpoint'}
         assert bag.topics['/planner/state'].latched
         assert bag.topics['/neighbors'].count == figures['frames']
