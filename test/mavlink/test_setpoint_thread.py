@@ -33,9 +33,9 @@ class Bridge:
     """A bridge, its gate, link and transport in one, which notes its calls."""
 
     def __init__(self):
-        self.gate = self.link = self.transport = self
+        self.gate = self.commands = self.link = self.transport = self
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.fault, self.broken, self.new_command = '', False, False
+        self.fault, self.broken, self.is_new = '', False, False
         self.calls = []
         self.send_odometry, self.stop, self.finish = (
             partial(self.note, name) for name in ('odometry', 'stop', 'finish'))
@@ -62,11 +62,11 @@ class Bridge:
         return ['a message']
 
     def take_command(self):
-        self.new_command = True
+        self.is_new = True
         self.note('command', time.monotonic())
 
     def cycle(self, now):
-        self.new_command = False
+        self.is_new = False
         self.note('cycle', now)
         if self.broken:
             raise RuntimeError('broken')
@@ -88,7 +88,9 @@ def make_stream():
             lambda cycle, now: passed['cycles'].append((cycle, now)), passed['errors'].append)
         streams.append(stream)
         stream.start()
+        end = time.monotonic() + DEADLINE
         while not passed['cycles']:
+            assert time.monotonic() < end, passed['errors']
             time.sleep(0.001)
         return bridge, stream, passed
     yield make
