@@ -131,6 +131,10 @@ class CameraSchedule:
         waited = (abs(stamp - camera.searched) + 1e-3) / (self._cameras * PORTION_PERIOD)
         return math.floor(min(waited, N_PORTIONS))
 
+    def has_time_for_all(self, camera: MountedCamera, stamp: float) -> bool:
+        """Return whether the images come so rarely that one has time for all portions."""
+        return abs(stamp - camera.processed) >= N_PORTIONS * PORTION_PERIOD
+
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, although none is missing."""
         if camera.swept == -math.inf:

@@ -200,8 +200,10 @@ class MountedCamera:
         """Stamps of the last whole images searched, s: for a missing neighbour; although none."""
         self.vain: dict[str, float] = {}
         """When a neighbour was last looked for without success, by the odometry's clock, s."""
+        self.processed = -math.inf
+        """Stamp of the last image, s."""
         self.searched_near = False
-        """Whether the last image was searched thoroughly near an expected place."""
+        """Whether the last image was searched thoroughly near an expected place, and no more."""
         self.portion = 0
         """Number of portions of whole images that were searched."""
         self.unchecked = dict.fromkeys(names, 0)

@@ -232,6 +232,7 @@ class Tracker:
             if found is not None and not look.known(found, self._side[name]):
                 look.others.append(found)
         self._detect(image, look)
+        look.camera.processed = stamp
         if self._schedule.sweep_due(look.camera, stamp):
             self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
@@ -369,10 +370,11 @@ class Tracker:
                     self._locate(search.near(image, look.model, dictionary,
                                              self._targets[name].neighbor, pose, thorough),
                                  'roi', image, look)
-        # One image has time for a thorough search near by, or for a portion of the whole image.
+        # Unless images are rare, one has time for a thorough search near by, or for a portion.
         near = any(look.expected[name].pose is not None for name in look.missing
                    if name in look.near)
-        camera.searched_near = near and not (due and camera.searched_near)
+        camera.searched_near = near and not (due and camera.searched_near) and (
+            not self._schedule.has_time_for_all(camera, look.stamp))
         if not look.missing or not due or camera.searched_near:
             return
         for _ in range(self._schedule.portions(camera, look.stamp)):

@@ -141,6 +141,15 @@ def test_the_cheapest_stage_that_finds_the_neighbour_is_used(image: GrayImage) -
     np.testing.assert_allclose(found['leader'].position, aside(-0.5).translation, atol=0.02)
 
 
+@pytest.mark.parametrize(('period', 'stages'), [
+    (1 / 30, ['roi', 'full', 'roi', 'full']), (0.2, ['full'] * 4)])
+def test_the_search_near_takes_turns_with_portions_unless_images_are_rare(
+        image: GrayImage, period: float, stages: list[str]) -> None:
+    drone = hovering(period=period)
+    drone.see(image)
+    assert [drone.see(EMPTY).stage for _ in stages] == stages
+
+
 @pytest.mark.parametrize(('rate', 'every', 'most'), [(60.0, 2, 1), (30.0, 1, 1), (7.0, 1, 4)])
 def test_whole_images_are_searched_in_portions_at_a_limited_rate(
         monkeypatch: pytest.MonkeyPatch, rate: float, every: int, most: int) -> None:
