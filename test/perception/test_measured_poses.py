@@ -16,36 +16,21 @@
 
 from __future__ import annotations
 
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
+from path_traced import camera_of, DATA, light_of, load_module, MOUNTING, tracker_of
 import pytest
-from test_path_traced import TAIL
 
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import quaternion_from_rpy, Transform
 from flock_follower.messages import from_odometry, odometry
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.pose_messages import from_pose, pose_with_covariance, transforms
 
-HERE = Path(__file__).resolve()
-DATA = HERE.parents[3] / 'shared' / 'data' / 'rendered'
+JUDGE = Path(__file__).resolve().parents[2] / 'benchmarks' / 'poses.py'
 IMAGES = 60
-
-
-def load(path: Path) -> ModuleType:
-    spec = spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_pose_message_holds_pose_covariance_and_stamp() -> None:
@@ -83,15 +68,12 @@ def test_nees_of_measured_poses_of_path_traced_flights(flight: str) -> None:
 
 def figures_of(name: str) -> dict[str, float]:
     """Return the figures of the first images of a flight, see benchmarks/poses.py."""
-    judged, motion = load(HERE.parents[2] / 'benchmarks' / 'poses.py'), load(DATA / 'traj.py')
+    judged, motion = load_module(JUDGE), load_module(DATA / 'traj.py')
     flight = motion.flight(name)
     own, leader, time = flight['F'], flight['L'][0], flight['t']
-    fx, fy, cx, cy = flight['cam']['K']
     with np.load(DATA / f'{name}.npz') as file:
         ends, packed, stamps = np.cumsum(file['sizes']), file['jpg'], file['stamps'][:IMAGES]
-    mounting = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
-    tracker = Tracker(NeighborConfig(flight['tag'], (MarkedNeighbor('leader', (
-        Marker(leader['mid'], leader['size'], TAIL),)),)), mounting)
+    camera, tracker = camera_of(flight), tracker_of(flight)
     times = np.arange(max(stamps[0] - 0.1, 0.0), stamps[-1] + 0.02, 0.01)
     turns = motion.rot_at(time, own['R'], times).as_quat()
     samples = [OdometrySample(*row) for row in zip(
@@ -107,16 +89,12 @@ def figures_of(name: str) -> dict[str, float]:
     for k, (stamp, me, other) in enumerate(zip(stamps.tolist(), poses(own), poses(leader))):
         while samples and samples[0].stamp <= stamp + 0.01:
             tracker.feed_odometry(samples.pop(0))
-        data = packed[(ends[k - 1] if k else 0):ends[k]]
-        light = (cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) / 255.0)**2.2
+        light = light_of(packed, ends, k)
         electrons = 1e4 * np.clip(1.5 * light, 0.0, 1.0)
         electrons += np.sqrt(electrons + 64.0) * noise.standard_normal(light.shape)
         image = np.rint(255.0 * np.clip(1e-4 * electrons, 0.0, 1.0)**(1.0 / 2.2)).astype(np.uint8)
-        height, width = image.shape
-        camera = CameraModel(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-                             np.array(flight['cam']['D']), 'plumb_bob', width, height)
         for measured in tracker.process_image(stamp, image, camera).poses.values():
             errors.append(judged.errors_of(
-                *measured, (me @ mounting).inverse() @ other))
+                *measured, (me @ MOUNTING).inverse() @ other))
     figures: dict[str, float] = judged.summary(errors)
     return figures

@@ -16,37 +16,22 @@
 
 from __future__ import annotations
 
-from importlib.util import module_from_spec, spec_from_file_location
 import math
-from pathlib import Path
 from typing import Any
 
 import cv2
-from marker_images import TAIL
 import numpy as np
+from path_traced import camera_of, DATA, light_of, load_module, tracker_of
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.measurement import angle
-from flock_follower.perception.tracker import camera_mounting, Tracker
 
-DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'rendered'
 if not (DATA / 'room_hd.npz').exists():
     pytest.skip('the path-traced flights (../shared/data/rendered) are not here',
                 allow_module_level=True)
 IMAGES = 6
-
-
-def motion() -> Any:
-    """Return the module that has the exact motion of the flights."""
-    spec = spec_from_file_location('path_traced_motion', DATA / 'traj.py')
-    assert spec is not None and spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def smeared(image: Array, length: float, direction: float) -> Array:
@@ -66,15 +51,10 @@ def smeared(image: Array, length: float, direction: float) -> Array:
 @pytest.mark.parametrize(('cells', 'direction'), [(0.0, 0.0), (0.8, 0.7)])
 def test_a_smeared_first_image_does_not_lock_the_mirrored_attitude(
         cells: float, direction: float) -> None:
-    motion_of = motion()
+    motion_of = load_module(DATA / 'traj.py')
     flight = motion_of.flight('room_hd')
     own, leader, time = flight['F'], flight['L'][0], flight['t']
-    fx, fy, cx, cy = flight['cam']['K']
-    camera = CameraModel(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-                         np.array(flight['cam']['D']), 'plumb_bob', 1920, 1080)
-    tracker = Tracker(NeighborConfig(flight['tag'], (MarkedNeighbor('leader', (
-        Marker(leader['mid'], leader['size'], TAIL),)),)),
-        camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    camera, tracker = camera_of(flight), tracker_of(flight)
 
     def state(body: dict[str, Any], stamp: float) -> tuple[Array, Any]:
         return (motion_of.at(time, body['p'], stamp)[0],
@@ -89,8 +69,7 @@ def test_a_smeared_first_image_does_not_lock_the_mirrored_attitude(
                 tracker.feed_odometry(OdometrySample(
                     at, place, attitude.as_quat()[0], motion_of.vel(time, own['p'], at)[0],
                     motion_of.rate(time, own['R'], at)[0]))
-            packed = file['jpg'][ends[k] - file['sizes'][k]:ends[k]]
-            light = (cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE) / 255.0)**2.2
+            light = light_of(file['jpg'], ends, k)
             if k == 0 and cells:
                 side = math.dist(*motion_of.corners(flight, stamp)[0][:2])
                 light = smeared(light, cells * side / 6.0, direction)
