@@ -60,7 +60,9 @@ class PoseInputs:
         self._judged: dict[str, deque[tuple[float, bool]]] = {
             name: deque(maxlen=N_POSES_JUDGED) for name in sources}
         self._waiting = dict.fromkeys(self._names, '')
-        """Why each topic is not subscribed yet, or not used; '' if no publisher is there."""
+        """Why each topic gives no poses now, or ''."""
+        self._contested: set[str] = set()
+        """Topics with several publishers: their poses are refused."""
         self._subscribed: set[str] = set()
         frames = perceiver.tracker.config.frames_topic
         self._frames = node.resolve_topic_name(frames) if frames else ''
@@ -83,7 +85,9 @@ class PoseInputs:
         for topic, name in self._names.items():
             ends = self._node.get_publishers_info_by_topic(topic)
             self._waiting[topic] = '' if ends else 'no publisher'
+            self._contested.discard(topic)
             if len(ends) > 1:
+                self._contested.add(topic)
                 self._waiting[topic] = f'{len(ends)} publishers'
             types = {end.topic_type for end in ends}
             if topic in self._subscribed or not types:
@@ -122,7 +126,7 @@ class PoseInputs:
                 self._use(name, stamped)
 
     def _take(self, topic: str, name: str, message: Any) -> None:
-        if self._waiting[topic]:
+        if topic in self._contested:
             self._node.diagnostics.reject(TWO_PUBLISHERS, f'{name}: {topic}')
         else:
             self._use(name, message)
