@@ -18,7 +18,7 @@ from flock_follower.gate.envelope import Location
 from flock_follower.gate.obstacle import Obstacle, Refusal
 from flock_follower.gate.relative_flight import Relative
 from flock_follower.gate.setpoint_rules import decide
-from flock_follower.gate.situation import AcceptedCommand, Held, Report, Situation
+from flock_follower.gate.situation import AcceptedCommand, Held, Situation, VehicleReport
 
 #: What is not known, and what nothing requests.
 UNKNOWN = {'withheld': '', 'place': Location(), 'held': Held(), 'relative': Relative(),
@@ -30,7 +30,7 @@ def situation(limits, known, *, command=None, command_age=0.05, source_age=0.2, 
     """Return a situation at the time 0; ages in s, ``unplaced`` a text."""
     return Situation(
         now=0.0, limits=limits, start_limits=full or limits, known=known,
-        report=Report(armed, airborne, link_age, mode_age),
+        report=VehicleReport(armed, airborne, link_age, mode_age),
         command=None if command is None else AcceptedCommand(command, -command_age, -source_age),
         unplaced=Refusal(Obstacle.HEIGHT_STALE, unplaced) if unplaced else None,
         **UNKNOWN | more)

@@ -38,7 +38,7 @@ from flock_follower.gate.obstacle import Refusal
 from flock_follower.gate.permission import Permission, Phase
 from flock_follower.gate.relative_flight import RelativeFlight
 from flock_follower.gate.setpoint_rules import Setpoint
-from flock_follower.gate.situation import AcceptedCommand, Held, Report, Situation
+from flock_follower.gate.situation import AcceptedCommand, Held, Situation, VehicleReport
 from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
 from flock_follower.gate.velocity_check import (
     finite_vector,
@@ -76,7 +76,7 @@ class Commands:
 
 
 @dataclass
-class Flight:
+class ReportedFlight:
     """What the autopilot reports of the flight; a time is infinite while it does not hold."""
 
     status: VehicleStatus | None = None
@@ -136,7 +136,7 @@ class Gate:
         self.commands = Commands()
         self.situation: Situation | None = None
         """That of the last decision."""
-        self._flight = Flight()
+        self._flight = ReportedFlight()
         self._flown = Flown()
         self._disturbance = DisturbanceObserver()
         self._height_watch = HeightWatch()
@@ -305,7 +305,7 @@ class Gate:
         flight = self._flight
         self._notice_landing(now)
         # In flight only a lasting landed report counts: a false one must not remove thrust.
-        report = Report(flight.is_armed, flight.airborne is True or flight.was_active,
+        report = VehicleReport(flight.is_armed, flight.airborne is True or flight.was_active,
                         link_age, mode_age)
         active = self.permission.phase is Phase.ACTIVE
         flight.active_since = onset(flight.active_since, active, now)
@@ -320,7 +320,7 @@ class Gate:
         self._record(situation, setpoint, engaged)
         return setpoint, situation.command if setpoint.kind == setpoint_rules.COMMAND else None
 
-    def _observe(self, report: Report, withheld: str, engaged: bool, distrusted: bool,
+    def _observe(self, report: VehicleReport, withheld: str, engaged: bool, distrusted: bool,
                  now: float) -> Situation:
         """Update the estimates to ``now``, s, and return the situation."""
         known = self.motion.compare(

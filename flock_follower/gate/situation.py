@@ -57,7 +57,7 @@ class Held(NamedTuple):
     """m."""
 
 
-class Report(NamedTuple):
+class VehicleReport(NamedTuple):
     """What the autopilot reports of the vehicle, and how old that is."""
 
     armed: bool
@@ -82,7 +82,7 @@ class Situation:
     """Those at start, for braking and separation."""
     known: KnownMotion
     """The vehicle's motion, as far as it is known."""
-    report: Report
+    report: VehicleReport
     command: AcceptedCommand | None
     """The newest command."""
     withheld: str

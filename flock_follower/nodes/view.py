@@ -73,7 +73,7 @@ from flock_follower.perception.images import compute_in_one_thread, decode_image
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.topic_names import COMPRESSED, COMPRESSED_IMAGES, IMAGE, INFO, RAW_IMAGES
 from flock_follower.view.access import Access, is_loopback, TOKEN_BYTES
-from flock_follower.view.flight import Battery, Flight, pose, Report
+from flock_follower.view.flight import Battery, NodeReport, pose, ShownFlight
 from flock_follower.view.parameter_table import VIEW
 from flock_follower.view.picture import draw_picture
 
@@ -102,7 +102,7 @@ class View(FlockNode):
         super().__init__('view', **kwargs)
         from flock_follower.view.server import PageServer  # the only module that needs aiohttp
         values = self.declare(SPECS, dict).values
-        self._flight, self._odometry = Flight(), OdometryBuffer()
+        self._flight, self._odometry = ShownFlight(), OdometryBuffer()
         self._epoch: int | None = None
         """The stamp, ns, from which the times of odometry count."""
         self._distances: list[Range] = []
@@ -331,7 +331,7 @@ class View(FlockNode):
         for status in message.status:
             space, _, node = f'/{status.name}'.rpartition('/')
             if space == self.get_namespace().rstrip('/'):
-                self._flight.take_report(node, Report(
+                self._flight.take_report(node, NodeReport(
                     time.monotonic(), int.from_bytes(status.level, 'little'), status.message,
                     {pair.key: pair.value for pair in status.values}))
 

@@ -69,7 +69,7 @@ LOST, NEVER = 'PLANNER LOST', 'NO PLANNER'
 OUTLINE: Final = 24  # points of an ellipse
 
 
-class Report(NamedTuple):
+class NodeReport(NamedTuple):
     """The newest diagnostics of a node."""
 
     time: float
@@ -86,7 +86,7 @@ class Battery(NamedTuple):
     voltage: float
 
 
-class Flight:
+class ShownFlight:
     """Takes messages, and returns pages; not to be shared by threads."""
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class Flight:
         self._neighbors: dict[str, deque[tuple[OdometryState, float]]] = {}
         self._state = ''
         self._bridge: BridgeState | None = None
-        self._reports: dict[str, Report] = {}
+        self._reports: dict[str, NodeReport] = {}
         self._battery = Battery(-math.inf, math.nan, math.nan)
         self._distance: tuple[str, float] = '', math.nan
         self._distances: deque[tuple[float, float]] = deque()
@@ -145,7 +145,7 @@ class Flight:
         self._bridge = parse(text)
         self.note('bridge state', now)
 
-    def take_report(self, node: str, report: Report) -> None:
+    def take_report(self, node: str, report: NodeReport) -> None:
         """Take the diagnostics of a node."""
         self._reports[node] = report
         if node in LIMITS:

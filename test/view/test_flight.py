@@ -29,15 +29,15 @@ from flock_follower.messages import OdometryState, RELATIVE
 from flock_follower.view.flight import (
     Battery,
     clean,
-    Flight,
     from_above,
     HISTORY_LENGTH,
     LIMITS,
     LOST,
     NEIGHBORS_MAX,
     NEVER,
-    Report,
+    NodeReport,
     shadow,
+    ShownFlight,
 )
 from flock_follower.view.scene import BOX, ELLIPSOID, Shape
 
@@ -53,17 +53,17 @@ def state(child: str = 'leader', position: Any = (2.0, 0.0, 1.5), velocity: Any 
                          np.eye(3))
 
 
-def flight(**planner: str) -> Flight:
+def flight(**planner: str) -> ShownFlight:
     """Return a flight in TRACK behind a leader, everything of it received now."""
-    made = Flight()
+    made = ShownFlight()
     made.take_odometry(state('base_link', (0.0, 0.0, 1.5)), NOW)
     made.take_neighbor(state(), NOW)
     made.take_command(Command(np.array([0.2, 0.0, 0.0]), 0.0), NOW)
     made.take_state(planner.get('state', 'TRACK'))
     made.take_bridge('ACTIVE', NOW)
-    made.take_report('planner', Report(NOW, 0, 'running', {**PLANNER, **planner}))
-    made.take_report('relative_pose', Report(NOW, 0, 'running', {'image_raw_hz': '30.00'}))
-    made.take_report('mavlink_bridge', Report(
+    made.take_report('planner', NodeReport(NOW, 0, 'running', {**PLANNER, **planner}))
+    made.take_report('relative_pose', NodeReport(NOW, 0, 'running', {'image_raw_hz': '30.00'}))
+    made.take_report('mavlink_bridge', NodeReport(
         NOW, 0, 'running', {'autopilot': 'PX4', 'limited_by': 'v_max', 'setpoint': 'command'}))
     made.take_distance('leader', 2.0, NOW)
     made.take_battery(Battery(NOW, 0.78, 15.8))
@@ -88,7 +88,7 @@ def test_a_planner_that_is_silent_is_lost_whatever_its_latched_state() -> None:
     assert made.page(NOW + LIMITS['planner'])['state'] == 'TRACK'
     page = made.page(NOW + LIMITS['planner'] + 0.1)
     assert (page['state'], page['band'], page['limits'], page['engaged']) == (LOST, None, '', '')
-    assert Flight().page(NOW)['state'] == NEVER
+    assert ShownFlight().page(NOW)['state'] == NEVER
 
 
 def test_a_bridge_that_is_silent_has_no_autopilot() -> None:
@@ -109,14 +109,14 @@ def test_every_source_has_an_age_and_is_stale_after_its_limit() -> None:
         assert ages.keys() == LIMITS.keys()
         assert {source for source, (_, old) in ages.items() if old} == stale
         assert {age for age, _ in ages.values()} == {ahead}
-    assert all(age is None and old for _, age, old, _ in Flight().page(NOW)['ages'])
+    assert all(age is None and old for _, age, old, _ in ShownFlight().page(NOW)['ages'])
 
 
 def test_a_page_is_json_and_has_no_number_that_is_not_finite() -> None:
     made = flight()
     made.take_battery(Battery(NOW, math.nan, math.inf))
     made.take_distance('leader', math.nan, NOW)
-    for page in (made.page(NOW), Flight().page(NOW), made.history(NOW)):
+    for page in (made.page(NOW), ShownFlight().page(NOW), made.history(NOW)):
         json.dumps(page, allow_nan=False)
     assert made.page(NOW)['battery']['share'] is None
     assert made.page(NOW)['distance']['m'] == 2.0  # the last one that was known
@@ -125,9 +125,9 @@ def test_a_page_is_json_and_has_no_number_that_is_not_finite() -> None:
 
 def test_problems_come_worst_first_and_a_silent_node_is_one() -> None:
     made = flight()
-    made.take_report('visualizer', Report(NOW + 4.0, 1, 'slow', {}))
-    made.take_report('planner', Report(NOW + 4.0, 2, 'no tick', PLANNER))
-    made.take_report('mavlink_bridge', Report(NOW + 4.0, 0, 'running', {}))
+    made.take_report('visualizer', NodeReport(NOW + 4.0, 1, 'slow', {}))
+    made.take_report('planner', NodeReport(NOW + 4.0, 2, 'no tick', PLANNER))
+    made.take_report('mavlink_bridge', NodeReport(NOW + 4.0, 0, 'running', {}))
     warnings = made.page(NOW + 4.0)['warnings']
     assert [(one['level'], one['node']) for one in warnings] == [
         ('error', 'planner'), ('error', 'relative_pose'), ('warn', 'visualizer')]
@@ -145,7 +145,7 @@ def test_the_history_is_that_of_the_last_minute() -> None:
 
 
 def test_a_flood_of_names_is_bounded() -> None:
-    made = Flight()
+    made = ShownFlight()
     for number in range(1000):
         made.take_neighbor(state(f'n{number}'), NOW)
     assert len(made.page(NOW)['neighbors']) == NEIGHBORS_MAX
@@ -159,7 +159,7 @@ def test_places_of_another_frame_are_forgotten() -> None:
 
 
 def test_what_is_drawn_into_an_image_is_its_own_estimate_else_carried_to_its_stamp() -> None:
-    made = Flight()
+    made = ShownFlight()
     for k in range(3):
         made.take_neighbor(state(position=(2.0 + 0.1 * k, 0.0, 0.0), velocity=(1.0, 0.0, 0.0),
                                  stamp=k * 10**8), NOW)
