@@ -23,6 +23,7 @@ from typing import Any
 import cv2
 from marker_images import TAIL
 import numpy as np
+import pytest
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
@@ -35,7 +36,8 @@ MOUNTING: Transform = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 
 def load_module(path: Path) -> Any:
-    """Return the module of a file, such as DATA / 'traj.py' with the exact motion."""
+    """Return the module of a file, such as DATA / 'traj.py' with the motion; or skip (scipy)."""
+    pytest.importorskip('scipy')
     spec = spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
