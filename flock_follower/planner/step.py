@@ -31,7 +31,7 @@ import math
 
 import numpy as np
 
-from flock_follower.geometry import wrap_angle
+from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner import relative
 from flock_follower.planner.guard import (
     climb_range,
@@ -82,12 +82,12 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
         return memory, Decision(state, reason, rejected=rejected)
     me, tracking = at(memory.own, now), state is State.TRACK
-    # Commands that are not flown yet count as velocity; a part was flown since the measurement.
-    coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
+    # Velocity that was commanded and flown since the measurement, m/s; the rest is pending.
+    flown = memory.pending * (max(now - memory.own.stamp, 0.0) / params.response_time)
     memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
     neighbors = scene.neighbors
-    altitude, vertical = _altitude(memory, scene, ground, float(coming[2]), params, elapsed)
-    velocity = me.velocity + coming
+    altitude, vertical = _altitude(memory, scene, ground, flown, params, elapsed)
+    velocity = me.velocity + flown + memory.pending
     unlimited, fading = nominal(memory, state, me, velocity, neighbors, params)
     command = constrain(unlimited, vertical, altitude.climb, memory, scene, velocity, view, params)
     if me.stamp - memory.switched < relative.SETTLING:
@@ -153,16 +153,18 @@ def _occluded(memory: Memory, now: float, frames: Sequence[float], view: View) -
     return occlusion(memory.occlusion, n, me, frames, view, float(forward))
 
 
-def _altitude(memory: Memory, scene: Scene, ground: float | None, coming: float,
+def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,
               params: PlannerParams, elapsed: float) -> tuple[Altitude, float]:
     """
     Return the altitude to hold, and the vertical acceleration, m/s^2.
 
     The height of the lost neighbor is followed as far as it is predicted.
 
-    :param coming: vertical velocity that is commanded and not yet flown, m/s.
+    :param flown: velocity (3,), m/s, that was commanded and flown since the measurement. Without
+        it the control oscillates if odometry is late.
     """
     me, neighbors, missed = scene.me, scene.neighbors, scene.missed
+    me, coming = me._replace(velocity=me.velocity + flown), float(memory.pending[2])
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)

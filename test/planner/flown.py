@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 import math
 from typing import Any
 
@@ -52,20 +53,24 @@ class Follower:
     A follower in lock step; its yaw is the commanded one at once.
 
     :param lag: s in which an acceleration follows its command to 63 %.
+    :param late: age of its odometry at a tick, in ticks of 0.1 s.
     """
 
-    def __init__(self, params: PlannerParams = PARAMS, lag: float = 0.0) -> None:
+    def __init__(self, params: PlannerParams = PARAMS, lag: float = 0.0, late: int = 0) -> None:
         self.params, self.memory, self.now, self.yaw = params, Memory(), 0.0, 0.0
         self.position: Array = np.array([0.0, 0.0, 2.0])
         self.velocity, self.acceleration = np.zeros(3), np.zeros(3)
         self.jumped: Array = np.zeros(3)  # of its odometry
         self._share = 1.0 - math.exp(-0.01 / lag) if lag else 1.0
+        self._measured = deque[OwnState](maxlen=1 + late)
 
     def tick(self, *estimates: Neighbor, **inputs: Any) -> Decision:
         """Take a step with these estimates, and fly its command for 0.1 s."""
-        me = own(self.now, self.position + self.jumped, self.velocity, self.yaw)
-        self.memory, decision = step(self.memory, self.now, True, me, estimates, self.params,
-                                     ground=None if self.jumped.any() else 0.0, **inputs)
+        self._measured.append(
+            own(self.now, self.position + self.jumped, self.velocity, self.yaw))
+        self.memory, decision = step(
+            self.memory, self.now, True, self._measured[0], estimates, self.params,
+            ground=None if self.jumped.any() else 0.0, **inputs)
         for _ in range(10):
             self.acceleration = self.acceleration + self._share * (
                 commanded(decision) - self.acceleration)

@@ -21,6 +21,7 @@ from dataclasses import replace
 import math
 from typing import Any
 
+from flown import Follower, seen
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -165,3 +166,15 @@ def test_the_commanded_altitude_is_unknown_while_neighbors_limit_the_climb(
     altitude, _ = Altitude(3.0, 0.0, 10.0).controlled(
         me(2.5), PARAMS, least, most, raised=raised)
     assert altitude.commanded == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize('late', [0, 1, 2])
+@pytest.mark.parametrize('lag', [0.1, 0.3])
+def test_late_odometry_lets_the_height_settle(lag: float, late: int) -> None:
+    follower = Follower(lag=lag, late=late)
+    climbs = []
+    for _ in range(150):
+        follower.tick(seen(follower.now, (2.12, 0.0, 2.3)))
+        climbs.append(abs(follower.velocity[2]))
+    assert max(climbs[100:]) < 0.01
+    assert follower.position[2] == pytest.approx(2.3, abs=0.01)
