@@ -59,7 +59,7 @@ MARKER_TILT = 0.02  # rad: error of the attitude of a marker on its vehicle
 _USED = UpdateOutcome.STARTED, UpdateOutcome.USED, UpdateOutcome.SURPRISING
 _BODY_CENTER = np.zeros(3)
 _NO_ROTATION = np.eye(3)
-_POSE_COVARIANCE = YAW_NOISE ** 2 * np.eye(6)  # m^2 and rad^2; its part of the position is replaced
+_POSE_COVARIANCE = YAW_NOISE ** 2 * np.eye(6)  # m^2 and rad^2; its positions are replaced
 _PRINT_VELOCITY = np.zeros(3)  # m/s
 _PRINT_VELOCITY_COVARIANCE = 1e-4 * np.eye(3)  # (m/s)^2
 
@@ -140,7 +140,7 @@ class CameraViews:
         tilt = np.repeat(self._tilt.step(), m, axis=0)
         covariance = relative_noise(offsets, self._noise, self._turning(offsets, eyes))
         yaw_error = np.repeat(vio.yaw_error, m)
-        offsets = turned(_tilted(offsets, tilt), yaw_error)
+        offsets = turned(_tilt_offsets(offsets, tilt), yaw_error)
         # Along and across the line of sight are the covariance's own axes.
         drawn = sensing.noise * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
                                           self._drawn[image, :, :3])
@@ -267,7 +267,7 @@ class CameraViews:
                 for images, coming in zip(self._images, self._coming)]
 
 
-def _tilted(offsets: Array, tilt: Array) -> Array:
+def _tilt_offsets(offsets: Array, tilt: Array) -> Array:
     """Return offsets (n, 3) turned by small angles (n, 2) about x and y, rad."""
     x, y, z = offsets[:, 0], offsets[:, 1], offsets[:, 2]
     about_x, about_y = tilt[:, 0], tilt[:, 1]
