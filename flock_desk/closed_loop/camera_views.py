@@ -58,6 +58,8 @@ YAW_NOISE = 0.02  # rad: of a vehicle's yaw measured in an image
 MARKER_TILT = 0.02  # rad: error of the attitude of a marker on its vehicle
 _USED = UpdateOutcome.STARTED, UpdateOutcome.USED, UpdateOutcome.SURPRISING
 _BODY_CENTER = np.zeros(3)
+_NO_ROTATION = np.eye(3)
+_POSE_COVARIANCE = YAW_NOISE ** 2 * np.eye(6)  # m^2 and rad^2; its positions are replaced
 _PRINT_VELOCITY = np.zeros(3)  # m/s
 _PRINT_VELOCITY_COVARIANCE = 1e-4 * np.eye(3)  # (m/s)^2
 
@@ -135,9 +137,10 @@ class CameraViews:
         self.in_sight = self._in_sight(offsets, eyes)
         found = self._visible[image] & self.in_sight.ravel() & (not world.odometry_lost)
         self.seen = self.seen | found.reshape(self.seen.shape)
-        tilt = np.repeat(np.pad(self._tilt.step(), ((0, 0), (0, 1))), m, axis=0)
+        tilt = np.repeat(self._tilt.step(), m, axis=0)
         covariance = relative_noise(offsets, self._noise, self._turning(offsets, eyes))
-        offsets = turned(offsets + np.cross(tilt, offsets), np.repeat(vio.yaw_error, m))
+        yaw_error = np.repeat(vio.yaw_error, m)
+        offsets = turned(_tilt_offsets(offsets, tilt), yaw_error)
         # Along and across the line of sight are the covariance's own axes.
         drawn = sensing.noise * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
                                           self._drawn[image, :, :3])
@@ -146,7 +149,7 @@ class CameraViews:
         covariance = max(sensing.noise, 1e-3) ** 2 * covariance
         correction = vio.position - world.travel
         velocity_noise = sensing.velocity_noise * self._drawn[image, :, 3:]
-        yaws = (world.headings + np.repeat(vio.yaw_error, m)
+        yaws = (world.headings + yaw_error
                 + YAW_NOISE * self._turned[image] + self._askew)
         arrivals = np.maximum(now + self._latency[image],
                               world.placed(now) + world.odometry_latency).tolist()
@@ -264,12 +267,23 @@ class CameraViews:
                 for images, coming in zip(self._images, self._coming)]
 
 
+def _tilt_offsets(offsets: Array, tilt: Array) -> Array:
+    """Return offsets (n, 3) turned by small angles (n, 2) about x and y, rad."""
+    x, y, z = offsets[:, 0], offsets[:, 1], offsets[:, 2]
+    about_x, about_y = tilt[:, 0], tilt[:, 1]
+    result = np.empty_like(offsets)
+    result[:, 0] = x + about_y * z
+    result[:, 1] = y - about_x * z
+    result[:, 2] = z + (about_x * y - about_y * x)
+    return result
+
+
 def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
              ) -> Estimate | None:
     """Return the estimate after a place (3,), m, of a covariance (3, 3); None if it is refused."""
-    full = YAW_NOISE ** 2 * np.eye(6)
+    full = _POSE_COVARIANCE.copy()
     full[:3, :3] = covariance
-    outcome = track.update(now, Transform(translation=place), _BODY_CENTER, full)
+    outcome = track.update(now, Transform(_NO_ROTATION, place), _BODY_CENTER, full)
     return track.newest if outcome in _USED else None
 
 

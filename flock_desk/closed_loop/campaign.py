@@ -75,7 +75,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         now = k * COURSE_STEP
         world.advance(k)
         lookout.look(k)
-        log.distances()
+        log.step()
         if k % ODOMETRY_STEPS == 0:
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)

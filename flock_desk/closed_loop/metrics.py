@@ -33,7 +33,7 @@ import numpy as np
 
 from flock_desk.closed_loop.camera_views import CameraViews
 from flock_desk.closed_loop.follower import SimulatedFollower
-from flock_desk.closed_loop.world import World
+from flock_desk.closed_loop.world import Moment, World
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.flock import places
 from flock_desk.scenarios.scenario import Scenario
@@ -98,6 +98,8 @@ class FlightsLog:
         self._times: list[float] = []
         self._ticks: list[dict[str, Any]] = []
         """The arrays of ``Flights`` at each tick, one value or vector per row."""
+        self._moments: list[Moment] = []
+        """Those since the newest tick."""
         rows, m = len(world.starts), len(world.others)
         flock = world.scenario.flock
         self._names = world.scenario.company.names
@@ -105,28 +107,35 @@ class FlightsLog:
         ahead = [0] if flock is None else [place.ahead for place in places(flock)]
         self._edges: Any = self._others == np.tile(ahead, rows // m)[:, None]
 
-    def distances(self) -> None:
-        """Take the distances after a step; those before the first tick do not count."""
-        if not self._ticks:
+    def step(self) -> None:
+        """Take the places after a step; those before the first tick do not count."""
+        if self._ticks:
+            self._moments.append(Moment.of(self._world))
+
+    def _take_distances(self) -> None:
+        """Take the distances since the newest tick."""
+        if not self._moments:
             return
-        distance, last = self._world.distances, self._ticks[-1]
+        distance, last = self._world.distances_at(self._moments), self._ticks[-1]
+        self._moments = []
         band = self._world.scenario.flight
         farthest, edges = self._along(distance)
-        last['nearest'] = np.minimum(last['nearest'], distance.min(axis=1))
-        last['farthest'] = np.maximum(last['farthest'], farthest)
+        last['nearest'] = np.minimum(last['nearest'], distance.min(axis=(0, 2)))
+        last['farthest'] = np.maximum(last['farthest'], farthest.max(axis=0))
         out = edges & ((distance ** 2 <= band.d0) | (distance ** 2 >= band.d1))
-        many = edges.sum(axis=1)
+        many = edges.sum(axis=2)
         # A follower without a vehicle to follow is out of the band.
-        share = np.where(many > 0, out.sum(axis=1) / np.maximum(many, 1), 1.0)
-        last['outside'] = last['outside'] + COURSE_STEP * share
+        share = np.where(many > 0, out.sum(axis=2) / np.maximum(many, 1), 1.0)
+        last['outside'] = np.cumsum(COURSE_STEP * share, axis=0)[-1]
 
     def _along(self, distance: Array) -> tuple[Array, Any]:
-        """Return the greatest distance (n,), and the edges (n, m), to those present."""
+        """Return the greatest distance (..., n), and the edges (..., n, m), to those present."""
         edges = self._edges & np.isfinite(distance)
-        return np.where(edges, distance, 0.0).max(axis=1), edges
+        return np.where(edges, distance, 0.0).max(axis=-1), edges
 
     def tick(self, now: float, followers: Sequence[SimulatedFollower]) -> None:
         """Take the outcome of a tick of the planners."""
+        self._take_distances()
         world, rows, lookout = self._world, np.arange(len(followers)), self._lookout
         decisions = [follower.decision for follower in followers]
         for row, decision in enumerate(decisions):
@@ -157,6 +166,7 @@ class FlightsLog:
 
     def flights(self) -> Flights:
         """Return the collected figures."""
+        self._take_distances()
         return Flights(self._world.scenario, np.array(self._times), **{
             name: np.stack([tick[name] for tick in self._ticks], axis=1)
             for name in self._ticks[0]})

@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,21 @@ GATE_STEPS = 6  # of COURSE_STEP, between two setpoints
 ATTITUDE_ERROR = 0.01  # rad of tilt, both constant and varying
 ATTITUDE_MEMORY = 10.0  # s, correlation time of the varying tilt
 DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
+
+
+class Moment(NamedTuple):
+    """The places of all vehicles of a world at a step of it."""
+
+    step: int
+    followers: Array
+    """(rows, 3), m."""
+    present: Any
+    """Which vehicles are there (m + 1,), the leader first."""
+
+    @classmethod
+    def of(cls, world: World) -> Moment:
+        """Return the present one."""
+        return cls(world.step, world.vehicle.position, world.present.copy())
 
 
 class World:
@@ -72,13 +87,18 @@ class World:
         self.starts, self.yaws = self._starts(n)
         """Where each begins (rows, 3), m, and its yaw then (rows,), rad."""
         self.vehicle = Quadrotor(self.starts, self.yaws)
-        self._place(0)
-        self._flown = np.zeros((n * m, 3)), self.yaws.copy()
+        self.step = 0
+        """The number of the present step."""
+        self._flown: tuple[Array, Array] = np.zeros((n * m, 3)), self.yaws.copy()
         """The setpoints that are flown: accelerations (rows, 3), m/s^2, and yaws (rows,), rad."""
-        self._delays = [round(g.uniform(*scenario.response.delay) / COURSE_STEP)
-                        for g in self.random('delay')]
+        self.vehicle.steer(*self._flown)
+        delays = [round(g.uniform(*scenario.response.delay) / COURSE_STEP)
+                  for g in self.random('delay')]
+        self._rows_by_delay = {delay: [row for row, own in enumerate(delays) if own == delay]
+                               for delay in set(delays)}
+        """The rows whose vehicles obey so many steps after the next."""
         self._coming: deque[tuple[int, list[tuple[Array, float | None]]]] = deque(
-            maxlen=max(self._delays) // GATE_STEPS + 2)
+            maxlen=max(delays) // GATE_STEPS + 2)
         """The setpoints on their way to the vehicles, and the step when they were sent."""
         self._thrust_error = GaussMarkov(
             self.random('thrust'), 1, scenario.response.thrust_error,
@@ -112,13 +132,19 @@ class World:
         starts[..., 2] = altitude
         return starts.reshape(-1, 3), np.tile(facing_ahead(found), n)
 
-    def _place(self, k: int) -> None:
-        """Note where all vehicles are at step k."""
-        self._step = k
-        self.positions = self._all(self._leader[k], self.vehicle.position)
-        """The true positions (n, m + 1, 3), m, the leader first."""
-        self.offsets: Array = self.positions[:, self.others] - self.positions[:, 1:, None]
-        """From each follower to each of the others (n, m, m, 3), m, ENU."""
+    @property
+    def positions(self) -> Array:
+        """Return the true positions (n, m + 1, 3), m, the leader first."""
+        return self._all(self._leader[self.step], self.vehicle.position)
+
+    @property
+    def offsets(self) -> Array:
+        """Return the way from each follower to each of the others (n, m, m, 3), m, ENU."""
+        return self._offsets(self.positions)
+
+    def _offsets(self, positions: Array) -> Array:
+        offsets: Array = positions[:, self.others] - positions[:, 1:, None]
+        return offsets
 
     def _all(self, leader: Array, followers: Array) -> Array:
         """Return values of all vehicles (n, m + 1, ...), the leader first."""
@@ -128,7 +154,7 @@ class World:
     @property
     def velocities(self) -> Array:
         """Return the true velocities, (n, m + 1, 3), m/s, the leader first."""
-        return self._all(self._leader_velocity[self._step], self.vehicle.velocity)
+        return self._all(self._leader_velocity[self.step], self.vehicle.velocity)
 
     @property
     def headings(self) -> Array:
@@ -138,15 +164,23 @@ class World:
     @property
     def bodies(self) -> Array:
         """Return the rotations of the others of all rows (rows * m, 3, 3), FLU to ENU."""
-        leader = attitude(self._leader_axis[self._step], self._heading)
+        leader = attitude(self._leader_axis[self.step], self._heading)
         return self._all(leader, self.vehicle.rotation)[:, self.others].reshape(-1, 3, 3)
 
     @property
     def distances(self) -> Array:
         """Return the true distances, (rows, m) to the others, m; infinite if one is gone."""
-        both = self.present[self.others] & self.present[1:, None]
-        return np.where(both, np.sqrt(np.sum(self.offsets ** 2, axis=3)), np.inf).reshape(
-            -1, len(self.others))
+        return self.distances_at([Moment.of(self)])[0]
+
+    def distances_at(self, moments: Sequence[Moment]) -> Array:
+        """Return the true distances of some moments, (moments, rows, m), as ``distances``."""
+        steps, followers, present = zip(*moments)
+        leader = self._leader[list(steps)]
+        there = np.repeat(np.stack(present), leader.shape[1], axis=0)
+        both = there[:, self.others] & there[:, 1:, None]
+        offsets = self._offsets(self._all(leader.reshape(-1, 3), np.concatenate(followers)))
+        return np.where(both, np.sqrt(np.sum(offsets ** 2, axis=3)), np.inf).reshape(
+            len(moments), -1, len(self.others))
 
     def advance(self, k: int) -> None:
         """Advance from step k - 1 to step k."""
@@ -156,12 +190,14 @@ class World:
         if k % GATE_STEPS == 0:
             self.vehicle.thrust_error = self._thrust_error.step()[:, 0]
         self._take_setpoints(k)
-        self.vehicle.step(*self._flown, COURSE_STEP, wind=self._wind[(k - 1) // GATE_STEPS])
-        self._place(k)
+        self.vehicle.step(COURSE_STEP, wind=self._wind[(k - 1) // GATE_STEPS])
+        self.step = k
         if self.scenario.leader.heading == 'away':
+            followers = self.vehicle.position.reshape(len(self._heading), -1, 3)
+            center = np.add.reduce(followers[:, self.present[1:]], axis=1) / np.count_nonzero(
+                self.present[1:])
             self._heading = self._heading + COURSE_STEP * turn_rate(
-                self._heading, self._leader[k] - self.positions[:, 1:][
-                    :, self.present[1:]].mean(axis=1))
+                self._heading, self._leader[k] - center)
         else:
             self._heading = self._leader_heading[k]
         if k % ODOMETRY_STEPS == 0:
@@ -220,14 +256,17 @@ class World:
 
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given, in a while."""
-        self._coming.append((self._step, setpoints))
+        self._coming.append((self.step, setpoints))
 
     def _take_setpoints(self, k: int) -> None:
         """Let setpoints arrive that were sent as long ago as the vehicle of their row lags."""
         accelerations, yaws = self._flown
+        arrived = False
         for sent, setpoints in self._coming:
-            for row, delay in enumerate(self._delays):
-                if sent + 1 + delay == k:
-                    acceleration, yaw = setpoints[row]
-                    accelerations[row] = acceleration
-                    yaws[row] = yaws[row] if yaw is None else yaw
+            for row in self._rows_by_delay.get(k - sent - 1, ()):
+                acceleration, yaw = setpoints[row]
+                accelerations[row] = acceleration
+                yaws[row] = yaws[row] if yaw is None else yaw
+                arrived = True
+        if arrived:
+            self.vehicle.steer(accelerations, yaws)

@@ -78,7 +78,7 @@ def turn_rate(heading: Any, offset: Array) -> Any:
     """
     direction = np.arctan2(offset[..., 1], offset[..., 0])
     error = (direction - heading + math.pi) % (2.0 * math.pi) - math.pi
-    return np.clip(TURN_GAIN * error, -TURN_RATE, TURN_RATE)
+    return np.minimum(np.maximum(TURN_GAIN * error, -TURN_RATE), TURN_RATE)
 
 
 def course(scenario: Scenario, run: int) -> Course:

@@ -33,6 +33,17 @@ DIRECTIONS = {'front': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'back'
               'up': (0, 0, 1), 'down': (0, 0, -1)}
 
 
+def _camera_axes(direction: tuple[int, int, int]) -> tuple[Array, Array, Array]:
+    """Return where a camera looks, and its left and its top, on the body (3,) each."""
+    axis = np.array(direction, dtype=float)
+    up = np.array([-axis[2], 0.0, 1.0 - abs(axis[2])])
+    return axis, np.cross(up, axis), up
+
+
+_CAMERA_AXES = {name: _camera_axes(direction) for name, direction in DIRECTIONS.items()}
+_IDENTITY = np.eye(3)
+
+
 @dataclass(frozen=True)
 class PerceptionNoise:
     """
@@ -66,12 +77,12 @@ def relative_noise(offsets: Array, noise: PerceptionNoise, turning: ArrayLike = 
 
     :param turning: how fast each moves across the image (n,), rad/s.
     """
-    r2 = np.sum(offsets * offsets, axis=1)[:, None, None]
+    r2 = np.add.reduce(offsets * offsets, axis=1)[:, None, None]
     blur = 1.0 + noise.blur * np.asarray(turning)[..., None, None]
     along = ((noise.range_constant + noise.range_growth * r2) * blur) ** 2
     across = noise.lateral ** 2 * r2
     outer = offsets[:, :, None] * offsets[:, None, :] / r2
-    return across * np.eye(3) + (along - across) * outer
+    return across * _IDENTITY + (along - across) * outer
 
 
 def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise,
@@ -83,12 +94,11 @@ def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise,
     """
     on_body = np.einsum('nji,nj->ni', rotations, offsets)
     seen = np.zeros(len(offsets), dtype=bool)
-    for axis in (np.array(DIRECTIONS[camera], dtype=float) for camera in cameras):
-        up = np.array([-axis[2], 0.0, 1.0 - abs(axis[2])])
-        ahead, aside, above = (on_body @ each for each in (axis, np.cross(up, axis), up))
+    for camera in cameras:
+        ahead, aside, above = (on_body @ axis for axis in _CAMERA_AXES[camera])
         seen |= ((ahead > noise.nearest) & (np.abs(aside) < noise.half_width * ahead)
                  & (np.abs(above) < noise.half_height * ahead))
-    return seen & (np.sum(offsets * offsets, axis=1) <= noise.farthest ** 2)
+    return seen & (np.add.reduce(offsets * offsets, axis=1) <= noise.farthest ** 2)
 
 
 def facing(offsets: Array, rotations: Array, angle: float,
@@ -102,7 +112,10 @@ def facing(offsets: Array, rotations: Array, angle: float,
     """
     on_body = np.einsum('nji,nj->ni', rotations, offsets)
     least = math.cos(angle) * np.linalg.norm(offsets, axis=1)
-    return np.any([-on_body @ np.array(DIRECTIONS[f]) >= least for f in faces], axis=0)
+    shown = np.zeros(len(offsets), dtype=bool)
+    for face in faces:
+        shown |= -on_body @ _CAMERA_AXES[face][0] >= least
+    return shown
 
 
 def hidden(offsets: Array, present: Any, radius: float) -> Any:

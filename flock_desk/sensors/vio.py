@@ -65,6 +65,24 @@ class Odometry(NamedTuple):
     """(6, 6) of linear and angular velocity in the child frame."""
 
 
+class NormalBlocks:
+    """Standard normal vectors of n generators, drawn in blocks; no other may use these."""
+
+    def __init__(self, generators: Sequence[np.random.Generator], size: int) -> None:
+        self._generators, self._size = generators, size
+        self._drawn: Array = np.zeros((len(generators), 0, size))
+        self._used = 0
+
+    def draw(self) -> Array:
+        """Return the next (n, size)."""
+        if self._used == self._drawn.shape[1]:
+            self._drawn = np.stack([
+                g.standard_normal((_BLOCK, self._size)) for g in self._generators])
+            self._used = 0
+        self._used += 1
+        return self._drawn[:, self._used - 1]
+
+
 class Vio:
     """
     Position, velocity and yaw of n runs, step by step.
@@ -80,9 +98,7 @@ class Vio:
         self.yaw_error: Array = np.zeros(len(position))
         self._true, self._walked = position.copy(), position.copy()
         self._correction, self._slip = np.zeros_like(position), np.zeros_like(position)
-        self._generators = generators
-        self._drawn: Array = np.zeros((len(generators), 0, 13))
-        self._used = 0
+        self._normal = NormalBlocks(generators, 13)
         root = period ** 0.5
         self._yaw_walk = errors.yaw_walk * root
         self._walk = root * np.array(
@@ -93,7 +109,7 @@ class Vio:
 
     def step(self, position: Array, velocity: Array) -> None:
         """Take the true position and velocity (n, 3) one period later."""
-        draw, errors = self._draw(), self._errors
+        draw, errors = self._normal.draw(), self._errors
         self.yaw_error = self.yaw_error + self._yaw_walk * draw[:, 0]
         self._walked = (self._walked + turned(position - self._true, self.yaw_error)
                         + self._walk * draw[:, 1:4])
@@ -104,13 +120,6 @@ class Vio:
         self.position = self._walked + self._correction
         self.velocity = (turned(velocity, self.yaw_error) + self._slip
                          + errors.velocity_white * draw[:, 10:13])
-
-    def _draw(self) -> Array:
-        if self._used == self._drawn.shape[1]:
-            self._drawn = np.stack([g.standard_normal((_BLOCK, 13)) for g in self._generators])
-            self._used = 0
-        self._used += 1
-        return self._drawn[:, self._used - 1]
 
 
 class VioEstimator:
@@ -190,13 +199,13 @@ class GaussMarkov:
         first = np.stack([g.standard_normal((2, size)) for g in generators])
         self._bias = bias * first[:, 0]
         self._value: Array = deviation * first[:, 1]
-        self._generators, self._size, self._deviation = generators, size, deviation
+        self._normal = NormalBlocks(generators, size)
+        self._deviation = deviation
         self._keep = float(np.exp(-period / memory))
 
     def step(self) -> Array:
         """Return the values (n, size) one period later."""
-        fresh = np.stack([g.standard_normal(self._size) for g in self._generators])
-        self._value = _renewed(self._value, self._keep, self._deviation * fresh)
+        self._value = _renewed(self._value, self._keep, self._deviation * self._normal.draw())
         return self._bias + self._value
 
 
@@ -235,9 +244,10 @@ def true_odometry(track: Track, time: float) -> Odometry:
 
 def turned(vectors: Array, angle: Array) -> Array:
     """Return vectors (n, 3) turned about z by angles (n,), rad."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vectors[:, 0] - s * vectors[:, 1],
-                     s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]], axis=1)
+    c, s, x, y = np.cos(angle), np.sin(angle), vectors[:, 0], vectors[:, 1]
+    result = np.empty_like(vectors)
+    result[:, 0], result[:, 1], result[:, 2] = c * x - s * y, s * x + c * y, vectors[:, 2]
+    return result
 
 
 def _velocity(motion: Odometry) -> Array:

@@ -125,7 +125,8 @@ class EmbeddedAutopilot:
         messages = []
         vehicle, controller = self.vehicle, self.controller
         if now < self._silent_until:
-            vehicle.step((0.0, 0.0, 0.0), vehicle.yaw, STEP_TIME, powered=False)
+            vehicle.steer((0.0, 0.0, 0.0), vehicle.yaw)
+            vehicle.step(STEP_TIME, powered=False)
         else:
             controller.step(now)
             messages = self._due_messages(now)

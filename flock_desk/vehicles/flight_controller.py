@@ -258,8 +258,9 @@ class FlightController(ABC):
         self._detect_ground(wanted, dt)
         # From the frame of the estimate to the true one.
         error = self.estimator.yaw_error
-        self.vehicle.step(quaternion_to_matrix(quaternion_from_yaw(-error)) @ wanted,
-                          wrap_angle(self._yaw - error), dt, powered=self.armed, wind=self.wind)
+        self.vehicle.steer(quaternion_to_matrix(quaternion_from_yaw(-error)) @ wanted,
+                           wrap_angle(self._yaw - error))
+        self.vehicle.step(dt, powered=self.armed, wind=self.wind)
         self._flown = self.armed and (self._flown or not self.vehicle.landed)
         # PX4 counts from the report of its land detector on.
         if not (self.armed and self.vehicle.landed and (self.on_ground or not self.PROFILE.px4)):

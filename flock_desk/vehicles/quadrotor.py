@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array, GRAVITY, matrix_to_quaternion, matrix_to_rotation_vector
 
 _UP_ENU: Final[Array] = np.array([0.0, 0.0, 1.0])
+_HOVER_FORCE: Final[Array] = GRAVITY * _UP_ENU  # m/s^2, specific
 
 
 # Dynamics of a 250 mm to 450 mm quadrotor on PX4.
@@ -66,11 +67,16 @@ class Quadrotor:
         self.thrust_error: Any = THRUST_ERROR
         """Error of the hover thrust, m/s^2; one for each vehicle, or one for all."""
         self._before: tuple[Array, Any, float] = self.axis, self.yaw, 1.0
+        self.steer(self.acceleration, self.yaw)
+        self._rotation: Array | None = None
+        """That of this step, once it was asked for."""
 
     @property
     def rotation(self) -> Array:
         """Return the rotation FLU to ENU, heading along the yaw."""
-        return attitude(self.axis, self.yaw)
+        if self._rotation is None:
+            self._rotation = attitude(self.axis, self.yaw)
+        return self._rotation
 
     @property
     def quaternion(self) -> Array:
@@ -88,63 +94,78 @@ class Quadrotor:
         """Return whether the vehicle stands on the ground."""
         return self.position[..., 2] <= 0.0
 
-    def step(self, acceleration: ArrayLike, yaw: ArrayLike, dt: float, *, powered: bool = True,
-             wind: ArrayLike = 0.0) -> None:
+    def steer(self, acceleration: ArrayLike, yaw: ArrayLike) -> None:
+        """
+        Take a setpoint, which is flown until the next one.
+
+        :param acceleration: (..., 3), m/s^2, ENU, without gravity.
+        :param yaw: rad, ENU.
+        """
+        self._wanted = *self._nominal(np.asarray(acceleration, dtype=float)), np.asarray(yaw)
+
+    def step(self, dt: float, *, powered: bool = True, wind: ArrayLike = 0.0) -> None:
         """
         Move on by ``dt``, s.
 
-        :param acceleration: setpoint (..., 3), m/s^2, ENU, without gravity.
-        :param yaw: setpoint, rad, ENU.
         :param powered: False stops the motors.
         :param wind: velocity of the air (..., 3), m/s, ENU.
         """
         landed = self.landed
-        self._before = self.axis, self.yaw, dt
-        thrust, tilt = self._nominal(np.asarray(acceleration, dtype=float))
+        on_ground = landed.any()
+        self._before, self._rotation = (self.axis, self.yaw, dt), None
+        thrust, tilt, yaw = self._wanted
         if not powered:
             thrust = np.zeros_like(thrust)
-        tilt = np.where(landed[..., None], _UP_ENU, tilt)
+        if on_ground:
+            tilt = np.where(landed[..., None], _UP_ENU, tilt)
         self.thrust = self.thrust + (thrust - self.thrust) * -math.expm1(
             -dt / THRUST_TIME)
         self.axis = _turn(self.axis, tilt, -math.expm1(-dt / ATTITUDE_TIME))
         rate = np.minimum(np.maximum(
-            YAW_GAIN * _wrapped(np.asarray(yaw) - self.yaw),
+            YAW_GAIN * _wrapped(yaw - self.yaw),
             -YAW_RATE_MAX), YAW_RATE_MAX)
-        self.yaw = _wrapped(self.yaw + np.where(landed, 0.0, rate * dt))
-        self._move(dt, powered, landed, np.asarray(wind, dtype=float))
+        turn = rate * dt
+        self.yaw = _wrapped(self.yaw + (np.where(landed, 0.0, turn) if on_ground else turn))
+        self._move(dt, powered, landed if on_ground else None, np.asarray(wind, dtype=float))
 
     def _nominal(self, acceleration: Array) -> tuple[Array, Array]:
-        force: Array = acceleration + GRAVITY * _UP_ENU
+        force: Array = acceleration + _HOVER_FORCE
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
         up = np.maximum(force[..., 2], 0.1 * GRAVITY)
         level = np.hypot(force[..., 0], force[..., 1])
         most = up * math.tan(self._tilt_max)
-        force *= np.where(level > most, most / np.maximum(level, 1e-9), 1.0)[..., None]
+        steep = level > most
+        if steep.any():
+            force *= np.where(steep, most / np.maximum(level, 1e-9), 1.0)[..., None]
         force[..., 2] = up
-        size = np.sqrt(np.sum(force * force, axis=-1))
+        size = np.sqrt(np.add.reduce(force * force, axis=-1))
         return np.minimum(size, THRUST_MAX), force / size[..., None]
 
-    def _move(self, dt: float, powered: bool, landed: Any, wind: Array) -> None:
+    def _move(self, dt: float, powered: bool, landed: Any | None, wind: Array) -> None:
+        """Move on by ``dt``, s; ``landed`` is None if no vehicle stands on the ground."""
         force = self.thrust[..., None] * self.axis
         error = np.asarray(self.thrust_error if powered else 0.0)
         acceleration = (force + (error - GRAVITY)[..., None] * _UP_ENU
                         - DRAG * (self.velocity - wind))
-        # On the ground it stays until the thrust clearly exceeds its weight.
-        flying = ~(landed & (acceleration[..., 2] < 0.3))[..., None]
-        self.acceleration = np.where(flying, acceleration, 0.0)
-        velocity = np.where(flying, self.velocity + acceleration * dt, 0.0)
+        velocity = self.velocity + acceleration * dt
+        if landed is not None:
+            # On the ground it stays until the thrust clearly exceeds its weight.
+            flying = ~(landed & (acceleration[..., 2] < 0.3))[..., None]
+            acceleration = np.where(flying, acceleration, 0.0)
+            velocity = np.where(flying, velocity, 0.0)
         position = self.position + velocity * dt
         grounded = position[..., 2] <= 0.0
-        self.velocity = np.where(grounded[..., None], 0.0, velocity)
-        position[..., 2] = np.where(grounded, 0.0, position[..., 2])
-        self.position = position
+        if grounded.any():
+            velocity = np.where(grounded[..., None], 0.0, velocity)
+            position[..., 2] = np.where(grounded, 0.0, position[..., 2])
+        self.acceleration, self.velocity, self.position = acceleration, velocity, position
 
 
 def attitude(axis: Array, yaw: Any) -> Array:
     """Return rotations (..., 3, 3) FLU to ENU with z axes (..., 3), heading along yaw (...)."""
     rotation = np.empty((*axis.shape, 3))
     left = _cross(axis, np.cos(yaw), np.sin(yaw), 0.0)
-    left /= np.sqrt(np.sum(left * left, axis=-1, keepdims=True))
+    left /= np.sqrt(np.add.reduce(left * left, axis=-1, keepdims=True))
     rotation[..., 0] = _cross(left, axis[..., 0], axis[..., 1], axis[..., 2])
     rotation[..., 1], rotation[..., 2] = left, axis
     return rotation
@@ -153,22 +174,28 @@ def attitude(axis: Array, yaw: Any) -> Array:
 def _cross(a: Array, x: Any, y: Any, z: Any) -> Array:
     """Return vector products (..., 3) with vectors (x, y, z): np.cross takes ten times as long."""
     product = np.empty(a.shape)
-    product[..., 0] = a[..., 1] * z - a[..., 2] * y
-    product[..., 1] = a[..., 2] * x - a[..., 0] * z
-    product[..., 2] = a[..., 0] * y - a[..., 1] * x
+    east, north, up = a[..., 0], a[..., 1], a[..., 2]
+    product[..., 0] = north * z - up * y
+    product[..., 1] = up * x - east * z
+    product[..., 2] = east * y - north * x
     return product
 
 
 def _turn(axis: Array, target: Array, fraction: float) -> Array:
     """Return the unit vectors at a fraction of the way from axis to target, along the arc."""
-    cosine = np.minimum(np.sum(axis * target, axis=-1, keepdims=True), 1.0)
+    cosine = np.minimum(np.add.reduce(axis * target, axis=-1, keepdims=True), 1.0)
     angle = np.arccos(np.maximum(cosine, -1.0))
     sine = np.sin(angle)
     small = sine < 1e-6
-    sine = np.where(small, 1.0, sine)
-    turned = (np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine) * axis
-              + np.where(small, fraction, np.sin(fraction * angle) / sine) * target)
-    return turned / np.sqrt(np.sum(turned * turned, axis=-1, keepdims=True))
+    any_small = small.any()
+    if any_small:
+        sine = np.where(small, 1.0, sine)
+    of_axis, of_target = np.sin((1.0 - fraction) * angle) / sine, np.sin(fraction * angle) / sine
+    if any_small:
+        of_axis = np.where(small, 1.0 - fraction, of_axis)
+        of_target = np.where(small, fraction, of_target)
+    turned = of_axis * axis + of_target * target
+    return turned / np.sqrt(np.add.reduce(turned * turned, axis=-1, keepdims=True))
 
 
 def _wrapped(angle: Any) -> Any:

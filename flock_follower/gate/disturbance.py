@@ -107,8 +107,7 @@ class DisturbanceObserver:
             self._velocity = velocity
             return
         # The difference of two finite velocities may overflow.
-        error = (np.clip(velocity, -SANE, SANE)
-                 - np.clip(self._velocity, -SANE, SANE))
+        error = _sane(velocity) - _sane(self._velocity)
         self._velocity = self._velocity + elapsed * (
             self._response + self.acceleration + 2.0 * BANDWIDTH * error)
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
@@ -120,6 +119,11 @@ class DisturbanceObserver:
         self.acceleration = np.array([*wind, up])
         excessive = abs(up) > THRUST_OFFSET_MAX + ESTIMATE_NOISE
         self.excess_since = min(self.excess_since, now) if excessive else math.inf
+
+
+def _sane(velocity: Array) -> Array:
+    """Return a velocity (3,), each component within SANE: np.clip takes three times as long."""
+    return np.minimum(np.maximum(velocity, -SANE), SANE)
 
 
 #: Up to this difference, m, the vehicle counts as at the commanded height.

@@ -208,9 +208,9 @@ class Gate:
 
     def take_height(self, altitude: float, now: float, sensor: str = '') -> str:
         """Take an altitude, m, of a barometer or another sensor; return '' or the refusal."""
-        known = self.motion.known_motion(self.limits, now)
         # Also of an invalid source: a constant error is estimated and removed.
-        velocity = None if self.relative.reckoning else known.velocity or known.braking
+        velocity = None if self.relative.reckoning else self.motion.best_velocity(
+            self.limits, now)
         refused = self.heights.take(altitude, None if velocity is None else float(
             velocity.vector[2]), now, sensor)
         height = self.heights.altitude(now)
@@ -359,8 +359,10 @@ class Gate:
             flown.held, flown.yaw = None, setpoint.yaw
 
     def _notice_landing(self, now: float) -> None:
-        height = self.place(now).height
-        down = self._flight.airborne is False and (height is None or height < LANDED_HEIGHT)
+        down = False
+        if self._flight.airborne is False:
+            height = self.heights.height(now)
+            down = height is None or height < LANDED_HEIGHT
         self._flight.landed_since = onset(self._flight.landed_since, down, now)
         if now - self._flight.landed_since >= LANDED_TIME:
             self.permit(self.permission.landed())

@@ -42,6 +42,7 @@ from flock_follower.gate.velocity_check import (
     plausible_velocity,
     refusal,
     Source,
+    Velocity,
     VelocityComparison,
 )
 from flock_follower.geometry import Array
@@ -119,8 +120,13 @@ class MotionSources:
 
     def fresh_yaw(self, max_age: float, now: float) -> float | None:
         """Return the yaw, rad, the autopilot's first: it obeys in its own frame; else None."""
-        yaws = [self._sources[source].yaw() for source in (AUTOPILOT, ODOM)]
+        yaws = (self._sources[source].yaw() for source in (AUTOPILOT, ODOM))
         return next((yaw for yaw, time in yaws if now - time <= max_age), None)
+
+    def best_velocity(self, limits: GateLimits, now: float) -> Velocity | None:
+        """Return the velocity by the source; if there is none, that to brake with; or None."""
+        by_source = self._sources[self.source].motion(now).fresh_velocity(limits)
+        return by_source or self.known_motion(limits, now).braking
 
     def known_motion(self, limits: GateLimits, now: float) -> KnownMotion:
         """Return what is known of the motion at ``now``, s."""

@@ -87,7 +87,7 @@ class MotionReport(NamedTuple):
     @classmethod
     def from_odometry(cls, state: OdometryState) -> MotionReport:
         """Return the motion in a message of odometry."""
-        variance = float(np.trace(state.pose_covariance[:3, :3]))
+        variance = float(state.pose_covariance[:3, :3].trace())
         return cls(state.velocity, yaw_from_quaternion(state.quaternion), state.position,
                    math.sqrt(max(variance, 0.0)))
 
@@ -197,8 +197,13 @@ def finite_vector(value: ArrayLike | None) -> Array | None:
 
 def plausible_velocity(value: ArrayLike) -> Array | None:
     """Return a velocity as an array (3,), m/s; None if not finite, or faster than FASTEST_OWN."""
-    vector = finite_vector(value)
-    return vector if vector is not None and math.hypot(*vector.tolist()) <= FASTEST_OWN else None
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        return None
+    # Written so that NaN fails.
+    plausible = vector.shape == (3,) and math.hypot(*vector.tolist()) <= FASTEST_OWN
+    return vector if plausible else None
 
 
 #: The difference is averaged over this time, s. In flights on real autopilots' simulators single
@@ -245,7 +250,7 @@ class VelocityComparison:
     @property
     def difference(self) -> float:
         """Return the average difference, m/s."""
-        return float(np.linalg.norm(self._average))
+        return math.sqrt(self._average.dot(self._average))
 
     def disagreeing_for(self, now: float) -> float:
         """Return the time since they began to disagree, s; minus infinity if they agree."""
@@ -316,7 +321,12 @@ class Path:
 
     def _at(self, time: float) -> Array:
         """Return the position (3,), m, at a time, s, within the span."""
-        after = bisect_right(self._kept, time, key=itemgetter(0))
+        before, place = self._kept[-1]
+        if time == before:
+            return place
+        # The window most often begins between the first two.
+        after = 1 if time < self._kept[1][0] else bisect_right(
+            self._kept, time, key=itemgetter(0))
         before, place = self._kept[after - 1]
         if time == before:
             return place
@@ -336,8 +346,9 @@ def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     if end <= start or now - end > PATH_GAP:
         return np.zeros(3)
     moved = one.between(start, end)
-    cos, sin = math.cos(turn), math.sin(turn)
-    moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
+    if turn != 0.0:
+        cos, sin = math.cos(turn), math.sin(turn)
+        moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
     result: Array = moved - other.between(start, end)
     return result
 
@@ -367,7 +378,7 @@ class Source:
         :param max_age: of the velocity that the position is compared with, s.
         """
         p = finite_vector(position)
-        if p is not None and np.all(np.abs(p) < SANE):
+        if p is not None and max(map(abs, p.tolist())) < SANE:
             fresh = time - self.velocity_time <= max_age
             self.position = p
             self.path.take(p, self.velocity if fresh else None, time)
@@ -387,9 +398,10 @@ class Source:
 
     def yaw(self, time: float = math.inf) -> tuple[float, float]:
         """Return the yaw nearest to a time, s, in rad, and its own time; by default the newest."""
+        newest_time, newest = self.yaws[-1] if self.yaws else (-math.inf, 0.0)
+        if not newest_time > time:
+            return newest, newest_time
         yaws = tuple(self.yaws)  # a copy: diagnostics read it from another thread
-        if not yaws:
-            return 0.0, -math.inf
         after = bisect_right(yaws, time, key=itemgetter(0))
         near = yaws[max(after - 1, 0):after + 1]
         return min(reversed(near), key=lambda known: abs(known[0] - time))[::-1]
@@ -419,7 +431,7 @@ def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
 
 def _too_far(error: Array, std: float, other: str) -> Refusal | None:
     """Return that displacements differ by more than their deviation, both m, permits, or None."""
-    distance = float(np.linalg.norm(error))
+    distance = math.sqrt(error.dot(error))
     return None if not distance > max(TOLERANCE, 3.0 * std) else Refusal(
         Obstacle.DISPLACED, f'displacements of odom and of the {other} differ by '
         f'{distance:.1f} m in {WINDOW:g} s')

@@ -50,8 +50,9 @@ def state(flight):
 
 def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
     vehicle, tilts = Quadrotor((0, 0, 2), yaw=math.pi / 2), []
+    vehicle.steer([1.0, 0.0, 0.0], math.pi / 2)
     for _ in range(100):
-        vehicle.step([1.0, 0.0, 0.0], math.pi / 2, STEP_TIME)
+        vehicle.step(STEP_TIME)
         tilts.append(math.asin(vehicle.rotation[0, 2]))
     wanted = math.atan(1.0 / GRAVITY)
     assert [tilts[14], tilts[-1]] == pytest.approx([wanted * (1 - math.exp(-1)), wanted], rel=0.01)
@@ -62,7 +63,7 @@ def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
 def test_wind_pushes_the_vehicle_and_the_hover_thrust_errs():
     vehicle = Quadrotor((0, 0, 50))
     for _ in range(100):
-        vehicle.step([0.0, 0.0, 0.0], 0.0, STEP_TIME, wind=[5.0, 0.0, 0.0])
+        vehicle.step(STEP_TIME, wind=[5.0, 0.0, 0.0])
     gained = 1.0 - math.exp(-0.1)  # drag of 0.1 1/s, for 1 s
     assert vehicle.velocity == pytest.approx([5.0 * gained, 0.0, 0.08 * gained], rel=0.01)
 
