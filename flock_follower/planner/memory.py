@@ -51,8 +51,8 @@ class Motion(NamedTuple):
     """A neighbor's acceleration (3,), m/s^2, smoothed, and its velocity (3,), m/s, at a stamp."""
 
     stamp: float
-    velocity: Array
-    acceleration: Array
+    velocity: list[float]
+    acceleration: list[float]
 
 
 def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
@@ -63,16 +63,17 @@ def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> di
     """
     updated = {}
     for n in neighbors:
-        last, acceleration = motions.get(n.name), n.acceleration
+        last, own = motions.get(n.name), n.acceleration
+        velocity, acceleration = n.velocity.tolist(), None if own is None else own.tolist()
         if last is None or not 0.0 <= n.stamp - last.stamp <= SMOOTHING_GAP:
-            last = Motion(n.stamp, n.velocity,
-                          np.zeros(3) if acceleration is None else acceleration)
+            last = Motion(n.stamp, velocity, acceleration or [0.0, 0.0, 0.0])
         elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
             if acceleration is None:
-                acceleration = (n.velocity - last.velocity) / elapsed
-            last = Motion(n.stamp, n.velocity, last.acceleration - math.expm1(
-                -elapsed / SMOOTHING_TIME) * (acceleration - last.acceleration))
+                acceleration = [(v - w) / elapsed for v, w in zip(velocity, last.velocity)]
+            share = math.expm1(-elapsed / SMOOTHING_TIME)
+            last = Motion(n.stamp, velocity, [
+                u - share * (a - u) for a, u in zip(acceleration, last.acceleration)])
         updated[n.name] = last
     return updated
 
@@ -161,10 +162,10 @@ class Memory(NamedTuple):
     switched: float = -math.inf
     """When odometry was lost or returned last, s: the frame before is another one."""
 
-    def acceleration(self, n: Neighbor) -> Array:
+    def acceleration(self, n: Neighbor) -> list[float]:
         """Return a neighbor's acceleration, (3,), m/s^2; zero for a received one, as outdated."""
         motion = self.motions.get(n.name)
-        return np.zeros(3) if n.received or motion is None else motion.acceleration
+        return [0.0, 0.0, 0.0] if n.received or motion is None else motion.acceleration
 
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
         """Return the memory for another odometry frame, without positions of the old frame."""

@@ -109,7 +109,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     return memory, Decision(
         state, reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis,
-        retreat_velocity(memory, me, params), stamp,
+        retreat_velocity(memory, scene, params), stamp,
         command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
 

@@ -53,7 +53,7 @@ VIEW = FieldOfView.of_camera(info(), [0.0, 0.0, 0.0])
 
 
 def expected(position: Array, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Expected:
-    return Expected(position, np.array(velocity), np.zeros(3), 0.0, 0.0)
+    return Expected(position.tolist(), [*velocity], STILL, 0.0, 0.0, [*velocity])
 
 
 def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
