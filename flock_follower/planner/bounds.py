@@ -56,11 +56,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import GRAVITY, SHORTEST, wrap_angle
 from flock_follower.messages import SANE
 from flock_follower.planner.inputs import (
@@ -81,11 +79,11 @@ from flock_follower.planner.limits import (
     SIGHT,
 )
 from flock_follower.planner.params import (
+    Edges,
     FOLLOWER,
     GuardParams,
     Member,
     PlannerParams,
-    WIDEST_MARGIN,
 )
 from flock_follower.planner.sight import MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
@@ -103,29 +101,6 @@ IN_LINE = math.radians(30.0)  # the same behind a follower: a column that is pus
 MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each metre of arc that is left ...
 MARKER_SHARE = 0.3  # of v_max: ... and the speed with which a larger angle is reduced
 STILL = 0.0, 0.0, 0.0
-
-
-class Edges(NamedTuple):
-    """The distances, m, from a neighbour to stay between, and the uncertainty of its position."""
-
-    near: float
-    far: float = math.inf
-    margin: float = 0.0
-    """Margin to each edge, m."""
-    spread: float = 0.0
-    """Largest distance from its expected position, m ..."""
-    spreading: float = 0.0
-    """... and its growth rate, m/s."""
-    headway: float = 0.0
-    """Time, s, for which there is room at the own speed towards it, and ..."""
-    fastest: float = 0.0
-    """... at this speed of its own towards the vehicle, m/s."""
-
-    @classmethod
-    def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
-        """Return the edges of the law's band."""
-        near, far = math.sqrt(law.d0), math.sqrt(law.d1)
-        return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
 
 
 def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], edges: Edges,
@@ -179,7 +154,7 @@ def in_sight(it: Expected, position: Sequence[float], velocity: Sequence[float],
     :param radii: sum of its radius and the own one, m.
     :param headway: see ``Edges``, s.
     """
-    inner = Edges.of(params.law, params.guarding)
+    inner = params.edges
     band = Edges(inner.near + radii, inner.far + radii if followed else math.inf, inner.margin,
                  it.spread, it.spreading, headway, params.fastest)
     x, y, z = offset = difference(position, it.position)
@@ -230,7 +205,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     variance = float(along @ n.position_covariance @ along)
     # The measured rate; until the command acts only the own motion on that line changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
-    inner = Edges.of(params.law, params.guarding)
+    inner = params.edges
     band = inner._replace(
         near=inner.near + params.radius + n.member.radius, far=math.inf, spreading=it.spreading,
         spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))

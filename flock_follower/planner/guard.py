@@ -35,7 +35,6 @@ from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bounds import (
     clear_of_sphere,
     DOWNWASH,
-    Edges,
     in_sight,
     marker_bounds,
     sight_bounds,
@@ -111,13 +110,14 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     between does not shrink. From one that is near and approaches the vehicle backs away first: the
     climb gets the rest of ``v_max``.
     """
-    edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
-    rest = math.inf
+    edges, least, most = params.edges, -math.inf, math.inf
+    rest, here = math.inf, me.position.tolist()
     for n in neighbors:
         radii_sum = params.radius + n.member.radius
         near = edges.near + radii_sum
-        x, y, z = (n.position - me.position).tolist()
-        level, climb = math.hypot(x, y), float(n.velocity[2])
+        x, y, z = difference(n.position.tolist(), here)
+        vx, vy, climb = n.velocity.tolist()
+        level = math.hypot(x, y)
         if level < DOWNWASH * near:
             gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
             speed = min(params.guarding.closing(gap)[0], 0.0)
@@ -125,12 +125,15 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach, leaving = (-(x * vx + y * vy) / max(level, SHORTEST) for vx, vy, _ in (
-            n.velocity.tolist(), me.velocity.tolist()))
+        if math.hypot(level, z) >= CLOSE + radii_sum:
+            continue
+        approach = -(x * vx + y * vy) / max(level, SHORTEST)
+        vx, vy, _ = me.velocity.tolist()
+        leaving = -(x * vx + y * vy) / max(level, SHORTEST)
         needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
         leaving = 0.0 if beneath else max(approach, needed, leaving if needed > 0.0 else 0.0)
-        if math.hypot(level, z) < CLOSE + radii_sum and leaving > APPROACH_NOISE:
+        if leaving > APPROACH_NOISE:
             rest = min(rest, math.sqrt(max(params.fastest ** 2 - leaving ** 2, 0.0)))
     # The height between has priority over the rest of v_max.
     return max(least, min(-rest, most)), min(most, max(rest, least))
@@ -217,8 +220,8 @@ def retreat_velocity(memory: Memory, scene: Scene, params: PlannerParams) -> Arr
     if not coming:
         return None
     gap, approach, away = min(coming, key=lambda each: each[:2])
-    edges = Edges.of(params.law, params.guarding)
-    speed = approach - min(params.guarding.closing(gap - edges.near - edges.margin)[0], 0.0)
+    gap -= params.edges.near
+    speed = approach - min(params.guarding.closing(gap - params.edges.margin)[0], 0.0)
     speed = min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP)
     return speed * np.array(away)
 

@@ -115,7 +115,8 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
     for name, covariance, most in (
             ('position', n.position_covariance, params.max_position_std),
             ('velocity', n.velocity_covariance, params.max_velocity_std)):
-        variance = float(covariance.trace())
+        (xx, _, _), (_, yy, _), (_, _, zz) = covariance.tolist()
+        variance = xx + yy + zz
         if not 0.0 <= variance <= most ** 2:  # NaN is uncertain; some sources send -1 for unknown
             return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
     return None
@@ -123,7 +124,7 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
 
 def far(n: Neighbor, own: OwnState | None) -> Rejection | None:
     """Return the rejection of a neighbor farther away than any can be seen, or None."""
-    distance = 0.0 if own is None else math.dist(n.position, own.position)
+    distance = 0.0 if own is None else math.dist(n.position.tolist(), own.position.tolist())
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
 
 
@@ -193,12 +194,14 @@ def expected(n: Neighbor, acceleration: Sequence[float], age: float,
         acceleration = limit_norm(acceleration, TRUSTED_ACCELERATION).tolist()
         size = math.hypot(*acceleration)
     share = (size / ACCELERATION_NOISE) ** 4
-    a = [u * (share / (1.0 + share)) for u in acceleration]
+    significant = share / (1.0 + share)
+    a = [u * significant for u in acceleration]
     known = min(max(age, 0.0), TRUSTED_TIME)
     gained, soon = known * (age - 0.5 * known), min(age + params.response_time, TRUSTED_TIME)
-    blind = max(age - (params.heard_timeout if n.received else FRESH), 0.0)
-    most, fastest = params.leader_acceleration_max, params.leader_speed_max + math.hypot(*velocity)
-    speeding = min(blind, fastest / most) if most > 0.0 else 0.0
+    blind, most = age - (params.heard_timeout if n.received else FRESH), (
+        params.leader_acceleration_max)
+    speeding = min(blind, (params.leader_speed_max + math.hypot(*velocity)) / most) if (
+        blind > 0.0 and most > 0.0) else 0.0
     return Expected(
         [x + age * v + gained * u for x, v, u in zip(n.position.tolist(), velocity, a)],
         [v + soon * u for v, u in zip(velocity, a)], a if age < TRUSTED_TIME else [0.0, 0.0, 0.0],

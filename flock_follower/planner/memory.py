@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import math
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -218,7 +219,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped
-        n = n._replace(member=member(params.vehicles, n.name, n.received))
+        if (known := member(params.vehicles, n.name, n.received)) is not n.member:
+            n = n._replace(member=known)
         if vague and not (unusable or outside or old or n.received) and (
                 distance_known(n, me, params.max_position_std)):
             ranged[n.name] = n
@@ -241,8 +243,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
 
 def in_order(estimates: Iterable[Neighbor]) -> list[Neighbor]:
     """Return estimates by name and stamp, in an order that does not depend on the given one."""
-    found = list(estimates)
-    if len(found) > 1:
+    found = sorted(estimates, key=attrgetter('name'))
+    if len({n.name for n in found}) < len(found):
         found.sort(key=_rank)
     return found
 
@@ -278,4 +280,6 @@ def longest(n: Neighbor, params: PlannerParams) -> float:
 
 def off(now: Moving, before: Moving) -> float:
     """Return the distance of a state from its prediction by the state before, m."""
-    return math.dist(now.position, before.position + (now.stamp - before.stamp) * before.velocity)
+    elapsed = now.stamp - before.stamp
+    return math.dist(now.position.tolist(), [x + elapsed * v for x, v in zip(
+        before.position.tolist(), before.velocity.tolist())])

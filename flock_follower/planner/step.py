@@ -211,7 +211,7 @@ def _warnings(memory: Memory, scene: Scene, reason: str,
     if scene.state is State.TRACK:
         search = '' if leader is None else (
             f'looks for {leader.name}, last known {me.stamp - leader.stamp:.1f} s ago')
-        return (*filter(None, [reason, search]), *reports(memory, scene.neighbors, me, params))
+        return (*filter(None, [reason, search]), *reports(memory, scene.neighbors, params))
     retreated = 0.0 if memory.lost is None else memory.lost.retreated(me.position)
     if memory.lost is None or retreated < retreat(memory.lost, params) - 0.05:
         return ()

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
-from flown import Follower, own, seen
+from flown import Follower, own, seen, STILL
 from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
