@@ -77,8 +77,8 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     :param others: (m,) not part of the flock: separation with the L of the pair.
     :param most: largest pull of one neighbor, m/s^2.
     """
-    r2 = np.sum(offsets ** 2, axis=1, keepdims=True)
-    flock = np.vstack([np.zeros_like(differences[:1]), differences[~others]])
+    r2 = (offsets ** 2).sum(axis=1, keepdims=True)
+    flock = np.concatenate([np.zeros_like(differences[:1]), differences[~others]])
     scale = np.where(others[:, None], pair_disagreement(differences), disagreement(flock))
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
@@ -105,5 +105,5 @@ def pair_disagreement(differences: Array) -> Array:
 
 
 def _lengths(vectors: Array) -> Array:
-    lengths: Array = np.sqrt(np.sum(vectors ** 2, axis=-1))
+    lengths: Array = np.sqrt((vectors ** 2).sum(axis=-1))
     return lengths

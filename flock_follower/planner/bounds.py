@@ -54,14 +54,12 @@ above it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import Array, GRAVITY, SHORTEST, wrap_angle
+from flock_follower.geometry import GRAVITY, SHORTEST, wrap_angle
 from flock_follower.messages import SANE
 from flock_follower.planner.inputs import (
     Expected,
@@ -72,17 +70,20 @@ from flock_follower.planner.inputs import (
 from flock_follower.planner.limits import (
     Bound,
     COHESION,
+    difference,
     FENCE,
+    horizontal,
+    opposite,
     scalar_product,
     SEPARATION,
     SIGHT,
 )
 from flock_follower.planner.params import (
+    Edges,
     FOLLOWER,
     GuardParams,
     Member,
     PlannerParams,
-    WIDEST_MARGIN,
 )
 from flock_follower.planner.sight import MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
@@ -99,35 +100,12 @@ MARKER_ANGLE = math.radians(60.0)  # largest angle between a marker's normal and
 IN_LINE = math.radians(30.0)  # the same behind a follower: a column that is pushed back buckles
 MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each metre of arc that is left ...
 MARKER_SHARE = 0.3  # of v_max: ... and the speed with which a larger angle is reduced
-LEVEL = np.array([1.0, 1.0, 0.0])
+STILL = 0.0, 0.0, 0.0
 
 
-class Edges(NamedTuple):
-    """The distances, m, from a neighbour to stay between, and the uncertainty of its position."""
-
-    near: float
-    far: float = math.inf
-    margin: float = 0.0
-    """Margin to each edge, m."""
-    spread: float = 0.0
-    """Largest distance from its expected position, m ..."""
-    spreading: float = 0.0
-    """... and its growth rate, m/s."""
-    headway: float = 0.0
-    """Time, s, for which there is room at the own speed towards it, and ..."""
-    fastest: float = 0.0
-    """... at this speed of its own towards the vehicle, m/s."""
-
-    @classmethod
-    def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
-        """Return the edges of the law's band."""
-        near, far = math.sqrt(law.d0), math.sqrt(law.d1)
-        return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
-
-
-def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
-                  params: GuardParams, neighbor_acceleration: ArrayLike = (0.0, 0.0, 0.0),
-                  seen: bool = True, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
+def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], edges: Edges,
+                  params: GuardParams, neighbor_acceleration: Sequence[float] = STILL,
+                  seen: bool = True, velocity: Sequence[float] = STILL) -> list[Bound]:
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
@@ -139,37 +117,34 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     :param seen: the neighbor is in sight.
     :param velocity: own velocity (3,), m/s; of influence only with a headway.
     """
-    p = np.asarray(offset, dtype=float)
-    w = np.asarray(relative_velocity, dtype=float).tolist()
-    a = np.asarray(neighbor_acceleration, dtype=float).tolist()
-    distance = math.hypot(*p.tolist())
+    (x, y, z), w, a = offset, relative_velocity, neighbor_acceleration
+    distance = math.hypot(x, y, z)
     if not (SHORTEST < distance < SANE and math.hypot(*w, *a) < SANE):
         return []  # as for NaN, which fails every comparison
-    n = p / distance
-    unit = n.tolist()
-    rate = scalar_product(unit, w)
-    common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
+    n = x / distance, y / distance, z / distance
+    rate = scalar_product(n, w)
+    common = scalar_product(n, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
     # The growing sphere of possible places approaches at its growth rate.
     closing = rate - edges.spreading
-    own = np.asarray(velocity, dtype=float).tolist()
-    away = scalar_product(unit, own)
+    away = scalar_product(n, velocity)
     gap = distance - edges.near - edges.margin - edges.spread - edges.headway * max(
         edges.fastest - away, 0.0)
     speed, slope = params.closing(gap)
     lowest = common - (closing + speed) / params.T_g - slope * closing
     if edges.headway > 0.0:
-        turned = (scalar_product(w, own) - rate * away) / distance
+        turned = (scalar_product(w, velocity) - rate * away) / distance
         lowest = (lowest - slope * edges.headway * turned) / (1.0 + slope * edges.headway)
     bounds = [Bound(n, lowest, SEPARATION, distance, seen)]
     if math.isfinite(edges.far):
         speed, slope = params.closing(edges.far - edges.margin - distance)
         highest = common - (rate - speed) / params.T_g - slope * rate
-        bounds.append(Bound(-n, -highest, COHESION, distance, seen))
+        bounds.append(Bound(opposite(n), -highest, COHESION, distance, seen))
     return bounds
 
 
-def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             params: PlannerParams, radii: float = 0.0, headway: float = 0.0) -> list[Bound]:
+def in_sight(it: Expected, position: Sequence[float], velocity: Sequence[float], seen: bool,
+             followed: bool, params: PlannerParams, radii: float = 0.0, headway: float = 0.0
+             ) -> list[Bound]:
     """
     Return the bounds for one neighbor.
 
@@ -179,41 +154,43 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     :param radii: sum of its radius and the own one, m.
     :param headway: see ``Edges``, s.
     """
-    inner = Edges.of(params.law, params.guarding)
+    inner = params.edges
     band = Edges(inner.near + radii, inner.far + radii if followed else math.inf, inner.margin,
                  it.spread, it.spreading, headway, params.fastest)
-    offset, rate = position - it.position, velocity - it.velocity
+    x, y, z = offset = difference(position, it.position)
+    rate = difference(velocity, it.velocity)
     bounds = radial_bounds(offset, rate, band, params.guarding, it.acceleration,
                            velocity=velocity) if seen else []
-    x, y, z = offset.tolist()
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
         level = band._replace(near=(DOWNWASH if seen else 1.0) * inner.near + radii, far=math.inf)
-        bounds += radial_bounds(LEVEL * offset, LEVEL * rate, level, params.guarding,
-                                LEVEL * it.acceleration, seen, LEVEL * velocity)
+        bounds += radial_bounds(
+            horizontal(offset), horizontal(rate), level, params.guarding,
+            horizontal(it.acceleration), seen, horizontal(velocity))
     return bounds
 
 
-def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
+def stop(along: Sequence[float], left: float, velocity: Sequence[float],
+         params: PlannerParams) -> Bound:
     """Return the bound that stops the vehicle along a unit vector within ``left`` m."""
-    guarding, rate = params.guarding, float(along @ velocity)
+    guarding, rate = params.guarding, scalar_product(along, velocity)
     # Until the command acts the vehicle keeps its velocity.
     speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,
                                     max(guarding.b, STOP_SHARE * params.strongest))
     return Bound(
-        -along, (rate - max(speed, 0.0)) / guarding.T_g + slope * max(rate, 0.0), FENCE)
+        opposite(along), (rate - max(speed, 0.0)) / guarding.T_g + slope * max(rate, 0.0), FENCE)
 
 
 def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
-                    velocity: Array, params: PlannerParams) -> list[Bound]:
+                    velocity: Sequence[float], params: PlannerParams) -> list[Bound]:
     """
     Return the bound, if any, for a neighbor of which only the distance is known.
 
     :param known: the last estimate of its position; None without one.
     :param velocity: own velocity when the command acts (3,), m/s.
     """
-    acceleration = np.zeros(3) if n.acceleration is None else n.acceleration
+    acceleration = STILL if n.acceleration is None else n.acceleration.tolist()
     it = expected(n, acceleration, me.stamp - n.stamp, params)
-    sight = it.position - me.position
+    sight = np.subtract(it.position, me.position)
     distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
     if not level > SHORTEST:
         return []
@@ -228,16 +205,17 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     variance = float(along @ n.position_covariance @ along)
     # The measured rate; until the command acts only the own motion on that line changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
-    inner = Edges.of(params.law, params.guarding)
+    inner = params.edges
     band = inner._replace(
         near=inner.near + params.radius + n.member.radius, far=math.inf, spreading=it.spreading,
         spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))
-    return radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
-                         float(along @ it.acceleration) * towards, sure)
+    return radial_bounds((-distance * towards).tolist(), (-rate * towards).tolist(), band,
+                         params.guarding, (float(along @ it.acceleration) * towards).tolist(),
+                         sure)
 
 
-def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view: View,
-                 params: PlannerParams) -> list[Bound]:
+def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Expected, yaw: float,
+                 view: View, params: PlannerParams) -> list[Bound]:
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
 
@@ -250,26 +228,26 @@ def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view:
     :param offset: its position minus the own one, m; :param velocity: the own one, m/s.
     :param yaw: the own one, rad.
     """
-    x, y, z = offset.tolist()
+    x, y, z = offset
     distance = math.hypot(x, y)
     if distance < OVERHEAD:
         return []
     up, down = vertical(view, math.atan2(y, x) - yaw)
-    forward = np.array([x, y, 0.0]) / distance
+    forward = [x / distance, y / distance, 0.0]
     slope = z / distance
     # Its height alone never forces a horizontal motion: altitude control follows its height.
     faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
     slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
-    left = np.array([-y, x, 0.0]) / distance
-    passing = float(left @ (it.velocity - velocity))
+    left = [-y / distance, x / distance, 0.0]
+    passing = scalar_product(left, difference(it.velocity, velocity))
     turning = TURNING_SHARE * params.yaw_rate_max * distance
-    across = float(left @ it.acceleration)
-    return [Bound(-forward, -faster, SIGHT), Bound(forward, -slower, SIGHT),
+    across = scalar_product(left, it.acceleration)
+    return [Bound(opposite(forward), -faster, SIGHT), Bound(forward, -slower, SIGHT),
             Bound(left, (passing - turning) / TURNING_TIME + across, SIGHT),
-            Bound(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+            Bound(opposite(left), (-passing - turning) / TURNING_TIME - across, SIGHT)]
 
 
-def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
+def marker_bounds(offset: Sequence[float], velocity: Sequence[float], it: Expected, yaw: float,
                   member: Member, params: PlannerParams) -> list[Bound]:
     """
     Return the bounds on the viewing angle of a neighbour's marker.
@@ -280,17 +258,17 @@ def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
 
     :param yaw: the neighbour's, rad.
     """
-    x, y, _ = offset.tolist()
+    x, y, _ = offset
     distance = math.hypot(x, y)
     if distance < OVERHEAD or not member.faces:  # without a marker it has no angle
         return []
     there = math.atan2(-y, -x)
     off = min((wrap_angle(there - yaw - face) for face in member.faces), key=abs)
     side = math.copysign(1.0, off)
-    outward = side * np.array([y, -x, 0.0]) / distance
+    outward = [side * y / distance, -side * x / distance, 0.0]
     widest = IN_LINE if member.role == FOLLOWER else MARKER_ANGLE
     left = (widest - abs(off)) * distance
     fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
-    rate = float(outward @ (velocity - it.velocity))
-    across = float(outward @ it.acceleration)
-    return [Bound(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
+    rate = scalar_product(outward, difference(velocity, it.velocity))
+    across = scalar_product(outward, it.acceleration)
+    return [Bound(opposite(outward), (rate - fastest) / TURNING_TIME - across, SIGHT)]

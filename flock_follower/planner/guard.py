@@ -35,11 +35,10 @@ from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bounds import (
     clear_of_sphere,
     DOWNWASH,
-    Edges,
     in_sight,
-    LEVEL,
     marker_bounds,
     sight_bounds,
+    STILL,
     stop,
     STOP_SHARE,
 )
@@ -49,28 +48,29 @@ from flock_follower.planner.inputs import (
     Neighbor,
     OwnState,
     SEEN,
-    TRUSTED_TIME,
 )
 from flock_follower.planner.limits import (
     Bound,
     COHESION,
     constrained,
+    difference,
     FENCE,
     limit_command,
     limit_horizontal,
     LimitedCommand,
+    scalar_product,
     SEPARATION,
 )
 from flock_follower.planner.memory import longest, Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
-from flock_follower.planner.scene import Scene, silent
+from flock_follower.planner.scene import Scene, silent, SURE
 from flock_follower.planner.sight import View
 
+LEVEL = np.array([1.0, 1.0, 0.0])
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backing off
 DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
-SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
 UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
@@ -110,13 +110,14 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     between does not shrink. From one that is near and approaches the vehicle backs away first: the
     climb gets the rest of ``v_max``.
     """
-    edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
-    rest = math.inf
+    edges, least, most = params.edges, -math.inf, math.inf
+    rest, here = math.inf, me.position.tolist()
     for n in neighbors:
         radii_sum = params.radius + n.member.radius
         near = edges.near + radii_sum
-        x, y, z = (n.position - me.position).tolist()
-        level, climb = math.hypot(x, y), float(n.velocity[2])
+        x, y, z = difference(n.position.tolist(), here)
+        vx, vy, climb = n.velocity.tolist()
+        level = math.hypot(x, y)
         if level < DOWNWASH * near:
             gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
             speed = min(params.guarding.closing(gap)[0], 0.0)
@@ -124,12 +125,15 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach, leaving = (-(x * vx + y * vy) / max(level, SHORTEST) for vx, vy, _ in (
-            n.velocity.tolist(), me.velocity.tolist()))
+        if math.hypot(level, z) >= CLOSE + radii_sum:
+            continue
+        approach = -(x * vx + y * vy) / max(level, SHORTEST)
+        vx, vy, _ = me.velocity.tolist()
+        leaving = -(x * vx + y * vy) / max(level, SHORTEST)
         needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
         leaving = 0.0 if beneath else max(approach, needed, leaving if needed > 0.0 else 0.0)
-        if math.hypot(level, z) < CLOSE + radii_sum and leaving > APPROACH_NOISE:
+        if leaving > APPROACH_NOISE:
             rest = min(rest, math.sqrt(max(params.fastest ** 2 - leaving ** 2, 0.0)))
     # The height between has priority over the rest of v_max.
     return max(least, min(-rest, most)), min(most, max(rest, least))
@@ -142,16 +146,16 @@ def fences(lost: Loss | None, position: Array, velocity: Array,
         return []
     # The full m in a narrow band, too: nothing beyond the last line of sight was seen free.
     left = lost.free - params.guarding.m - float(lost.towards @ position)
-    onward = stop(lost.towards, left, velocity, params)
+    onward = stop(lost.towards.tolist(), left, velocity.tolist(), params)
     offset = LEVEL * (position - lost.origin)
     distance = math.hypot(*offset.tolist())
     if distance <= SHORTEST:
         return [onward]
     left = retreat(lost, params) - distance
-    return [stop(offset / distance, left, velocity, params), onward]
+    return [stop((offset / distance).tolist(), left, velocity.tolist(), params), onward]
 
 
-def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
+def retreating(bound: Bound, lost: Loss, position: Array, velocity: Sequence[float],
                params: PlannerParams, sideways: bool = True) -> Bound:
     """
     Return the bound of one out of sight, limited to the retreat.
@@ -159,7 +163,7 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
     :param sideways: whether it is the lost neighbor itself: the vehicle leaves its path.
     """
     far, offset = retreat(lost, params), LEVEL * (position - lost.origin)
-    direction = bound.normal
+    direction = np.array(bound.normal)
     # Not towards a neighbor that has moved to that side.
     sideways = sideways and float(direction @ lost.side) > -BESIDE
     if sideways and lost.approach > APPROACH_NOISE and far > 0.0:
@@ -168,8 +172,8 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
         direction = direction / max(math.hypot(*direction.tolist()), SHORTEST)
     along = float(direction @ offset)
     left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
-    most = -stop(direction, left, velocity, params).least
-    return bound._replace(normal=direction, least=min(bound.least, most))
+    most = -stop(direction.tolist(), left, velocity, params).least
+    return bound._replace(normal=direction.tolist(), least=min(bound.least, most))
 
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
@@ -192,7 +196,7 @@ def _longest_retreat(approach: float, params: PlannerParams, known: float = math
         coming * min(YIELD_TIME * approach, YIELD_MAX))
 
 
-def retreat_velocity(memory: Memory, me: OwnState, params: PlannerParams) -> Array | None:
+def retreat_velocity(memory: Memory, scene: Scene, params: PlannerParams) -> Array | None:
     """
     Return the velocity (3,), m/s, that keeps the distance to a neighbor that comes, or None.
 
@@ -201,24 +205,25 @@ def retreat_velocity(memory: Memory, me: OwnState, params: PlannerParams) -> Arr
     """
     if not params.guard or params.retreat_max == 0.0:
         return None
-    coming = list[tuple[float, float, Array]]()
+    coming, position = list[tuple[float, float, list[float]]](), scene.me.position.tolist()
     for n in memory.flock.values():
-        if me.stamp - n.stamp > longest(n, params):
+        if scene.me.stamp - n.stamp > longest(n, params):
             continue
-        it = _expected(n, memory, me, params)
-        soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
-        offset = LEVEL * (me.position - it.position)
-        distance = math.hypot(*offset.tolist())
-        away: Array = offset / max(distance, SHORTEST)
-        approach = max(float(away @ it.velocity), float(away @ soon.velocity))
+        it = scene.expected[n.name]
+        x, y, _ = difference(position, it.position)
+        distance = math.hypot(x, y)
+        length = max(distance, SHORTEST)
+        away = [x / length, y / length, 0.0]
+        approach = max(scalar_product(away, it.velocity), scalar_product(away, it.later))
         if approach > APPROACH_NOISE:
             coming.append((distance - params.radius - n.member.radius, approach, away))
     if not coming:
         return None
     gap, approach, away = min(coming, key=lambda each: each[:2])
-    edges = Edges.of(params.law, params.guarding)
-    speed = approach - min(params.guarding.closing(gap - edges.near - edges.margin)[0], 0.0)
-    return min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP) * away
+    gap -= params.edges.near
+    speed = approach - min(params.guarding.closing(gap - params.edges.margin)[0], 0.0)
+    speed = min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP)
+    return speed * np.array(away)
 
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
@@ -290,16 +295,16 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
 
     Without a camera a lost neighbor may be anywhere: the follower does not back away.
     """
-    near, me = list[Bound](), scene.me
+    near, me, moving = list[Bound](), scene.me, velocity.tolist()
     for name, n in memory.ranged.items():
         if name not in memory.neighbors:
-            near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
+            near += clear_of_sphere(n, memory.flock.get(name), me, moving, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
         if here or not (name in memory.ranged or (scene.blinded and not n.received)):
-            near += _neighbor_bounds(n, memory, scene, velocity, here, params)
+            near += _neighbor_bounds(n, memory, scene, moving, here, params)
     return ordered(near, fences(memory.lost, me.position, velocity, params),
-                   _sight_bounds(memory, scene, velocity, view, params))
+                   _sight_bounds(memory, scene, moving, view, params))
 
 
 def _covered(it: Expected, scene: Scene) -> bool:
@@ -308,7 +313,7 @@ def _covered(it: Expected, scene: Scene) -> bool:
 
     It comes no nearer unseen than that one, whose own bound holds.
     """
-    sight = it.position - scene.me.position
+    sight = np.subtract(it.position, scene.me.position)
     distance = math.hypot(*sight.tolist())
     for each in scene.neighbors.flock:
         offset = each.position - scene.me.position
@@ -319,17 +324,17 @@ def _covered(it: Expected, scene: Scene) -> bool:
     return False
 
 
-def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array, here: bool,
-                     params: PlannerParams) -> list[Bound]:
+def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequence[float],
+                     here: bool, params: PlannerParams) -> list[Bound]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
     me, neighbors = scene.me, scene.neighbors
     age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
     has_failed = silent(n, me.stamp, params)
-    places = [_hovering(n, params) if has_failed else _expected(n, memory, me, params)]
+    places = [_hovering(n, params) if has_failed else scene.expected[n.name]]
     if age > SEEN and not n.received:  # its acceleration is a guess: never chase
-        places.append(expected(n, np.zeros(3), age, params))
+        places.append(expected(n, STILL, age, params))
     if not (here or n.received):
         places = [it._replace(spread=0.0, spreading=0.0) if _covered(it, scene) else it
                   for it in places]
@@ -337,7 +342,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
     found = list[Bound]()
     for place in places:
-        found += in_sight(place, me.position, velocity, seen,
+        found += in_sight(place, me.position.tolist(), velocity, seen,
                           joined and place is places[-1], params, radii_sum, headway)
     if memory.lost is not None and not (seen or n.received):
         found = [retreating(each, memory.lost, me.position, velocity, params,
@@ -354,39 +359,26 @@ def _hovering(n: Neighbor, params: PlannerParams) -> Expected:
     stops = FAILING_TIME * n.velocity + 0.5 * float(n.velocity @ n.velocity) / (
         STOP_SHARE * params.strongest) * along
     variance = float(n.position_covariance.trace())
-    return Expected(n.position + stops, np.zeros(3), np.zeros(3),
-                    SURE * math.sqrt(max(variance, 0.0) / 3.0), 0.0)
+    return Expected((n.position + stops).tolist(), [*STILL], [*STILL],
+                    SURE * math.sqrt(max(variance, 0.0) / 3.0), 0.0, [*STILL])
 
 
-def _aside(away: Array) -> Array:
+def _aside(away: Sequence[float]) -> list[float]:
     """Return a unit vector between away from a place and across: to pass beside it."""
-    x, y, _ = away.tolist()
-    return math.sqrt(0.5) * np.array([x - y, y + x, 0.0])
+    x, y, _ = away
+    return [math.sqrt(0.5) * (x - y), math.sqrt(0.5) * (y + x), 0.0]
 
 
-def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
+def _sight_bounds(memory: Memory, scene: Scene, velocity: Sequence[float], view: View,
                   params: PlannerParams) -> list[Bound]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
     me, faced = scene.me, scene.neighbors.faced
     if faced is None or not view or faced.received:
         return []
     n = memory.flock[faced.name]
-    it = _expected(n, memory, me, params)
-    offset = it.position - me.position
+    it = scene.expected[faced.name]
+    offset = difference(it.position, me.position.tolist())
     bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:
         bounds += marker_bounds(offset, velocity, it, n.yaw, n.member, params)
     return bounds
-
-
-def _expected(n: Neighbor, memory: Memory, me: OwnState,
-              params: PlannerParams) -> Expected:
-    """Return the prediction of a neighbor; if received, with the spread of its covariance."""
-    age = me.stamp - n.stamp
-    it = expected(n, memory.acceleration(n), age, params)
-    if not n.received:  # errors of own sightings are part of the margin
-        return it
-    offset = it.position - me.position
-    along = offset / max(math.hypot(*offset.tolist()), SHORTEST)
-    variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along
-    return it._replace(spread=it.spread + SURE * math.sqrt(max(float(variance), 0.0)))

@@ -31,7 +31,7 @@ Nothing here reads a clock. The assumptions about a neighbor at the time when a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import math
 from typing import NamedTuple, TypeVar
 
@@ -115,7 +115,8 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
     for name, covariance, most in (
             ('position', n.position_covariance, params.max_position_std),
             ('velocity', n.velocity_covariance, params.max_velocity_std)):
-        variance = float(covariance.trace())
+        (xx, _, _), (_, yy, _), (_, _, zz) = covariance.tolist()
+        variance = xx + yy + zz
         if not 0.0 <= variance <= most ** 2:  # NaN is uncertain; some sources send -1 for unknown
             return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
     return None
@@ -123,7 +124,7 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
 
 def far(n: Neighbor, own: OwnState | None) -> Rejection | None:
     """Return the rejection of a neighbor farther away than any can be seen, or None."""
-    distance = 0.0 if own is None else math.dist(n.position, own.position)
+    distance = 0.0 if own is None else math.dist(n.position.tolist(), own.position.tolist())
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
 
 
@@ -164,31 +165,45 @@ FRESH = 0.12  # s up to which the guard's margin covers deviations of a neighbor
 
 
 class Expected(NamedTuple):
-    """The prediction of a neighbor for the time when a command acts."""
+    """
+    The prediction of a neighbor for the time when a command acts.
 
-    position: Array
+    Its vectors are lists: arrays of three numbers would take several times as long.
+    """
+
+    position: list[float]
     """(3,), m, now."""
-    velocity: Array
+    velocity: list[float]
     """(3,), m/s."""
-    acceleration: Array
+    acceleration: list[float]
     """(3,), m/s^2."""
     spread: float
     """Largest distance from that position, m ..."""
     spreading: float
     """... and its growth rate, m/s."""
+    later: list[float]
+    """Velocity in TRUSTED_TIME, if the acceleration lasts so long (3,), m/s."""
 
 
-def expected(n: Neighbor, acceleration: Array, age: float, params: PlannerParams) -> Expected:
+def expected(n: Neighbor, acceleration: Sequence[float], age: float,
+             params: PlannerParams) -> Expected:
     """Return the prediction of a neighbor whose estimate is of an age, s."""
-    a = limit_norm(acceleration, TRUSTED_ACCELERATION)
-    share = (math.hypot(*a.tolist()) / ACCELERATION_NOISE) ** 4
-    a = a * (share / (1.0 + share))
+    velocity = n.velocity.tolist()
+    size = math.hypot(*acceleration)
+    if not size <= TRUSTED_ACCELERATION:
+        acceleration = limit_norm(acceleration, TRUSTED_ACCELERATION).tolist()
+        size = math.hypot(*acceleration)
+    share = (size / ACCELERATION_NOISE) ** 4
+    significant = share / (1.0 + share)
+    a = [u * significant for u in acceleration]
     known = min(max(age, 0.0), TRUSTED_TIME)
-    position = n.position + age * n.velocity + known * (age - 0.5 * known) * a
-    velocity = n.velocity + min(age + params.response_time, TRUSTED_TIME) * a
-    blind = max(age - (params.heard_timeout if n.received else FRESH), 0.0)
-    most, fastest = params.leader_acceleration_max, (
-        params.leader_speed_max + math.hypot(*n.velocity.tolist()))
-    speeding = min(blind, fastest / most) if most > 0.0 else 0.0
-    return Expected(position, velocity, a if age < TRUSTED_TIME else np.zeros(3),
-                    most * speeding * (blind - 0.5 * speeding), most * speeding)
+    gained, soon = known * (age - 0.5 * known), min(age + params.response_time, TRUSTED_TIME)
+    blind, most = age - (params.heard_timeout if n.received else FRESH), (
+        params.leader_acceleration_max)
+    speeding = min(blind, (params.leader_speed_max + math.hypot(*velocity)) / most) if (
+        blind > 0.0 and most > 0.0) else 0.0
+    return Expected(
+        [x + age * v + gained * u for x, v, u in zip(n.position.tolist(), velocity, a)],
+        [v + soon * u for v, u in zip(velocity, a)], a if age < TRUSTED_TIME else [0.0, 0.0, 0.0],
+        most * speeding * (blind - 0.5 * speeding), most * speeding,
+        [v + TRUSTED_TIME * u for v, u in zip(velocity, a)])

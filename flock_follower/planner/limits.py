@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
-from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -62,7 +61,7 @@ class LimitedCommand(NamedTuple):
 class Bound(NamedTuple):
     """A bound on the acceleration a (3,), m/s^2: normal . a >= least."""
 
-    normal: Array
+    normal: Sequence[float]
     """(3,); it need not be of unit length."""
     least: float
     reason: str
@@ -224,11 +223,11 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     fastest = max(v_max, speed * INSIDE) if flyable else v_max
     requested = a.tolist()
     if not flyable or not all(map(math.isfinite, requested)) or all(
-            scalar_product(each.normal.tolist(), requested) >= each.least for each in required):
+            scalar_product(each.normal, requested) >= each.least for each in required):
         return limit_command(a, v, a_max, fastest, period)
     # The bounds on which the horizontal part has an influence.
     sides = [(complex(x, y), each.least - z * requested[2], each.reason)
-             for each in required for x, y, z in [each.normal.tolist()]
+             for each in required for x, y, z in [each.normal]
              if math.hypot(x, y) > STEEP]
     bounds = [side[:2] for side in sides]
     missed = [product(normal, complex(*requested[:2])) < least for normal, least in bounds]
@@ -294,6 +293,27 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     return limit_norm(step / time_constant, strongest)
 
 
-def scalar_product(one: list[float], other: list[float]) -> float:
-    """Return the scalar product; of three numbers it takes a third of what arrays take."""
-    return sum(map(mul, one, other))
+def scalar_product(one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the scalar product of two vectors (3,), in a tenth of the time of arrays."""
+    x, y, z = one
+    u, v, w = other
+    return x * u + y * v + z * w
+
+
+def difference(one: Sequence[float], other: Sequence[float]) -> list[float]:
+    """Return one vector (3,) minus another."""
+    x, y, z = one
+    u, v, w = other
+    return [x - u, y - v, z - w]
+
+
+def opposite(vector: Sequence[float]) -> list[float]:
+    """Return a vector (3,) with the other sign."""
+    x, y, z = vector
+    return [-x, -y, -z]
+
+
+def horizontal(vector: Sequence[float]) -> list[float]:
+    """Return a vector (3,) without its vertical part."""
+    x, y, _ = vector
+    return [x, y, 0.0]

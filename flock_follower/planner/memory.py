@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import math
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -51,8 +52,8 @@ class Motion(NamedTuple):
     """A neighbor's acceleration (3,), m/s^2, smoothed, and its velocity (3,), m/s, at a stamp."""
 
     stamp: float
-    velocity: Array
-    acceleration: Array
+    velocity: list[float]
+    acceleration: list[float]
 
 
 def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
@@ -63,16 +64,17 @@ def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> di
     """
     updated = {}
     for n in neighbors:
-        last, acceleration = motions.get(n.name), n.acceleration
+        last, own = motions.get(n.name), n.acceleration
+        velocity, acceleration = n.velocity.tolist(), None if own is None else own.tolist()
         if last is None or not 0.0 <= n.stamp - last.stamp <= SMOOTHING_GAP:
-            last = Motion(n.stamp, n.velocity,
-                          np.zeros(3) if acceleration is None else acceleration)
+            last = Motion(n.stamp, velocity, acceleration or [0.0, 0.0, 0.0])
         elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
             if acceleration is None:
-                acceleration = (n.velocity - last.velocity) / elapsed
-            last = Motion(n.stamp, n.velocity, last.acceleration - math.expm1(
-                -elapsed / SMOOTHING_TIME) * (acceleration - last.acceleration))
+                acceleration = [(v - w) / elapsed for v, w in zip(velocity, last.velocity)]
+            share = math.expm1(-elapsed / SMOOTHING_TIME)
+            last = Motion(n.stamp, velocity, [
+                u - share * (a - u) for a, u in zip(acceleration, last.acceleration)])
         updated[n.name] = last
     return updated
 
@@ -161,10 +163,10 @@ class Memory(NamedTuple):
     switched: float = -math.inf
     """When odometry was lost or returned last, s: the frame before is another one."""
 
-    def acceleration(self, n: Neighbor) -> Array:
+    def acceleration(self, n: Neighbor) -> list[float]:
         """Return a neighbor's acceleration, (3,), m/s^2; zero for a received one, as outdated."""
         motion = self.motions.get(n.name)
-        return np.zeros(3) if n.received or motion is None else motion.acceleration
+        return [0.0, 0.0, 0.0] if n.received or motion is None else motion.acceleration
 
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
         """Return the memory for another odometry frame, without positions of the old frame."""
@@ -217,7 +219,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped
-        n = n._replace(member=member(params.vehicles, n.name, n.received))
+        if (known := member(params.vehicles, n.name, n.received)) is not n.member:
+            n = n._replace(member=known)
         if vague and not (unusable or outside or old or n.received) and (
                 distance_known(n, me, params.max_position_std)):
             ranged[n.name] = n
@@ -240,8 +243,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
 
 def in_order(estimates: Iterable[Neighbor]) -> list[Neighbor]:
     """Return estimates by name and stamp, in an order that does not depend on the given one."""
-    found = list(estimates)
-    if len(found) > 1:
+    found = sorted(estimates, key=attrgetter('name'))
+    if len({n.name for n in found}) < len(found):
         found.sort(key=_rank)
     return found
 
@@ -277,4 +280,6 @@ def longest(n: Neighbor, params: PlannerParams) -> float:
 
 def off(now: Moving, before: Moving) -> float:
     """Return the distance of a state from its prediction by the state before, m."""
-    return math.dist(now.position, before.position + (now.stamp - before.stamp) * before.velocity)
+    elapsed = now.stamp - before.stamp
+    return math.dist(now.position.tolist(), [x + elapsed * v for x, v in zip(
+        before.position.tolist(), before.velocity.tolist())])

@@ -60,14 +60,15 @@ class Neighborhood(NamedTuple):
     """The neighbor that it faces and keeps in sight."""
     level: Neighbor | None
     """The neighbor whose altitude it follows; None: it holds its altitude."""
+    distances: Mapping[str, float]
+    """Between the centers, m."""
+
+    def clearance(self, n: Neighbor, params: PlannerParams) -> float:
+        """Return the distance between the own hull and a neighbor's, m."""
+        return max(self.distances[n.name] - (params.radius + n.member.radius), 0.0)
 
 
-NOBODY = Neighborhood((), {}, frozenset(), None, None)
-
-
-def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
-    """Return the distance between the own hull and a neighbor's, m."""
-    return max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0)
+NOBODY = Neighborhood((), {}, frozenset(), None, None, {})
 
 
 def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: PlannerParams,
@@ -78,9 +79,12 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: Pl
     :param memory: with the relations of the step before, ``elapsed`` seconds ago.
     :param flock: all neighbors at hand, at one time; at least one of them can be followed.
     """
+    here = me.position.tolist()
+    distances = {n.name: math.dist(n.position.tolist(), here) for n in flock}
     if len(flock) == 1:  # most often; one to avoid is never the only neighbor
         only = flock[0]
-        return Neighborhood(flock, {only.name: 1.0}, frozenset([only.name]), only, only)
+        return Neighborhood(
+            flock, {only.name: 1.0}, frozenset([only.name]), only, only, distances)
     joined = edges(memory.edges, me, flock, params)
     change, before = elapsed / max(params.handover_time, params.period), memory.shares
     shares = {n.name: min(max(before.get(n.name, 0.0) + (
@@ -93,10 +97,11 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: Pl
     ahead = [n for n in leaders if n.name in joined]
     seen = [[n for n in some if not n.received] for some in (ahead, ends, leaders)]
     # Never turn away from a neighbor in sight to one that is only received.
-    faced = _nearest(me, memory.faced, next(filter(None, [*seen, ahead, leaders, ends]), []))
+    first = next(filter(None, [*seen, ahead, leaders, ends]), [])
+    faced = _nearest(distances, memory.faced, first)
     # Several followers without a leader would follow their own motion if they followed each other.
-    level = _nearest(me, memory.faced, leaders) or (faced if len(ends) < 2 else None)
-    return Neighborhood(flock, shares, joined, faced, level)
+    level = _nearest(distances, memory.faced, leaders) or (faced if len(ends) < 2 else None)
+    return Neighborhood(flock, shares, joined, faced, level, distances)
 
 
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
@@ -117,34 +122,35 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     # A received position never removes the edge to the only leader in sight. Beyond the band such
     # an edge does not begin beside others: it would pull past the vehicle between.
     kept = [n.name for n in seen if len(seen) == 1 and n.member.role == LEADER and (
-        not held or n.name in held or apart(n, me, params) ** 2 < params.law.d1)]
+        not held or n.name in held or max(math.dist(n.position, me.position) - (
+            params.radius + n.member.radius), 0.0) ** 2 < params.law.d1)]
     return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 
-def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]) -> Neighbor | None:
+def _nearest(distances: Mapping[str, float], held: str,
+             flock: Sequence[Neighbor]) -> Neighbor | None:
     """Return the nearest neighbor, or the one held, unless another is clearly nearer."""
     return min(flock, default=None, key=lambda n: (
-        math.dist(n.position, me.position) / (HELD if n.name == held else 1.0), n.name))
+        distances[n.name] / (HELD if n.name == held else 1.0), n.name))
 
 
 KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
 
 
-def reports(memory: Memory, neighbors: Neighborhood, me: OwnState,
-            params: PlannerParams) -> list[str]:
+def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> list[str]:
     """Return warnings of neighbors that it cannot follow, and of those whose place is unknown."""
     v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
     for n in neighbors.flock:
-        edge, distance, speed = n.name in neighbors.edges, apart(n, me, params), math.hypot(
-            *n.velocity.tolist())
-        found += [f'{n.name} {text}' for applies, text in (
-            (edge and speed > KEPT_UP_WITH * v_max,
-             f'at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up'),
-            (distance < near,
-             f'{distance:.2f} m away, the band begins at {near:.2f} m: too close'),
-            (edge and distance > far,
-             f'{distance:.2f} m away, the band ends at {far:.2f} m: too far')) if applies]
+        edge, distance = n.name in neighbors.edges, neighbors.clearance(n, params)
+        speed = math.hypot(*n.velocity.tolist())
+        if edge and speed > KEPT_UP_WITH * v_max:
+            found.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
+        if distance < near:
+            found.append(f'{n.name} {distance:.2f} m away, the band begins at {near:.2f} m: '
+                         'too close')
+        if edge and distance > far:
+            found.append(f'{n.name} {distance:.2f} m away, the band ends at {far:.2f} m: too far')
     missing = {name for name, each in params.vehicles.items() if each.role != AVOID}
     missing -= memory.flock.keys()  # with those lost a moment ago
     return [*found, *(f'{name} neither seen nor received, not kept clear of'
@@ -188,8 +194,8 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
         return (np.zeros(3) if state is State.COAST else brake(
             velocity, params.strongest, params.brake_time_constant)), None
     flock = neighbors.flock
-    offsets = np.array([_offset(n, me, params) for n in flock])
-    differences = np.array([n.velocity - me.velocity for n in flock])
+    offsets = _offsets(neighbors, me, params)
+    differences = np.array([n.velocity for n in flock]) - me.velocity
     if len(flock) == 1:
         law = params.law.command(offsets, differences)
     else:
@@ -197,7 +203,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
         others = np.array([n.member.role == AVOID for n in flock])
         law = graph_law(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
-    if any(apart(n, me, params) ** 2 <= params.law.d0 for n in flock):
+    if any(neighbors.clearance(n, params) ** 2 <= params.law.d0 for n in flock):
         return law, None  # too near already: no fade-in
     if memory.params is not params and memory.params != params:
         fading = np.zeros(3) if memory.command is None else memory.command, me.stamp
@@ -210,9 +216,12 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     return command + max(done, 0.0) * (limit_norm(law, params.a_max) - command), fading
 
 
-def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
-    """Return the vector (3,), m, from the own hull to a neighbor's."""
-    offset: Array = n.position - me.position
-    distance = max(math.hypot(*offset.tolist()), GAP_MIN)
-    gap = max(distance - (params.radius + n.member.radius), GAP_MIN)
-    return offset * (gap / distance)
+def _offsets(neighbors: Neighborhood, me: OwnState, params: PlannerParams) -> Array:
+    """Return the vectors (m, 3), m, from the own hull to those of the neighbors."""
+    shares = []
+    for n in neighbors.flock:
+        distance = max(neighbors.distances[n.name], GAP_MIN)
+        gap = max(distance - (params.radius + n.member.radius), GAP_MIN)
+        shares.append([gap / distance])
+    offsets: Array = np.array([n.position for n in neighbors.flock]) - me.position
+    return offsets * np.array(shares)

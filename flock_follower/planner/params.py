@@ -18,7 +18,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 import math
+from typing import NamedTuple
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.messages import DUPLICATE, FASTEST, POSITION_STD_MAX
@@ -100,6 +102,29 @@ class GuardParams(Checked):
         b = self.b if b is None else b
         root = math.sqrt(self.tau ** 2 + 2.0 * gap / b)
         return b * (root - self.tau), 1.0 / root
+
+
+class Edges(NamedTuple):
+    """The distances, m, from a neighbour to stay between, and the uncertainty of its position."""
+
+    near: float
+    far: float = math.inf
+    margin: float = 0.0
+    """Margin to each edge, m."""
+    spread: float = 0.0
+    """Largest distance from its expected position, m ..."""
+    spreading: float = 0.0
+    """... and its growth rate, m/s."""
+    headway: float = 0.0
+    """Time, s, for which there is room at the own speed towards it, and ..."""
+    fastest: float = 0.0
+    """... at this speed of its own towards the vehicle, m/s."""
+
+    @classmethod
+    def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
+        """Return the edges of the law's band."""
+        near, far = math.sqrt(law.d0), math.sqrt(law.d1)
+        return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
 
 
 #: Largest ``v_max`` beside other followers, m/s: in columns of six with 2 m/s members were lost,
@@ -235,6 +260,11 @@ class PlannerParams(Checked):
     def fastest(self) -> float:
         """Return the largest speed at which it keeps clear of others, m/s."""
         return max(self.v_max, self.v_max_start)
+
+    @cached_property
+    def edges(self) -> Edges:
+        """Return the edges of the law's band, for all neighbors of all ticks."""
+        return Edges.of(self.law, self.guarding)
 
     @property
     def climb_rate(self) -> float:

@@ -146,13 +146,13 @@ def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighb
     :param others: likewise, those to keep clear of.
     """
     law, age = params.law, me.stamp - leader.stamp
-    a = np.zeros(3) if leader.acceleration is None else leader.acceleration
+    a = [0.0, 0.0, 0.0] if leader.acceleration is None else leader.acceleration.tolist()
     there = expected(leader, a, age, params)
     velocity = me.velocity + coming
-    gap, towards = _gap(there.position, me, leader, params)
+    gap, towards = _gap(np.array(there.position), me, leader, params)
     middle = math.sqrt(0.5 * (law.d0 + law.d1))
     approach = limit_norm(GAIN * (gap - middle) * towards, min(SPEED, params.v_max))
-    relative = approach + there.velocity[:2] - velocity[:2]
+    relative = approach + np.array(there.velocity[:2]) - velocity[:2]
     result: Array = relative / TIME
     for n in others:
         other = n.position + (me.stamp - n.stamp) * n.velocity

@@ -23,7 +23,7 @@ sight of the neighbor that the vehicle followed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import math
 from typing import NamedTuple
 
@@ -32,6 +32,7 @@ import numpy as np
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.inputs import (
     at,
+    Expected,
     expected,
     Neighbor,
     newest,
@@ -45,6 +46,8 @@ from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import gathered, Neighborhood, NOBODY, sought
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.vertical_yaw import OVERHEAD
+
+SURE = 2.0  # standard deviations of a received position that count as possible places
 
 
 class Decision(NamedTuple):
@@ -95,6 +98,8 @@ class Scene(NamedTuple):
     """The leader to look for while others are followed."""
     missed: Neighbor | None
     """The lost neighbor: ``leader``, or the newest one of those lost if none is followed."""
+    expected: Mapping[str, Expected]
+    """Predictions of the neighbors to keep clear of, by name."""
 
 
 def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: PlannerParams,
@@ -109,10 +114,24 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
     missed = leader
     if leader is None and neighbors.faced is None:
         missed = newest((n for n in flock.values() if n.member.role != AVOID), me)
-    scene = Scene(state, me, blinded, neighbors, leader, missed)
-    return memory._replace(
-        flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
-        lost=_loss(memory, flock, scene, params)), scene
+    brought_up = memory._replace(flock=flock, motions=observed(
+        memory.motions, flock.values()) if flock else memory.motions)
+    scene = Scene(state, me, blinded, neighbors, leader, missed, {
+        name: _expected(n, brought_up, me, params) for name, n in flock.items()})
+    return brought_up._replace(lost=_loss(memory, flock, scene, params)), scene
+
+
+def _expected(n: Neighbor, memory: Memory, me: OwnState,
+              params: PlannerParams) -> Expected:
+    """Return the prediction of a neighbor; if received, with the spread of its covariance."""
+    age = me.stamp - n.stamp
+    it = expected(n, memory.acceleration(n), age, params)
+    if not n.received:  # errors of own sightings are part of the margin
+        return it
+    offset = np.subtract(it.position, me.position)
+    along = offset / max(math.hypot(*offset.tolist()), SHORTEST)
+    variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along
+    return it._replace(spread=it.spread + SURE * math.sqrt(max(float(variance), 0.0)))
 
 
 def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
@@ -141,7 +160,8 @@ def awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> N
     """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
     age = min(now - n.stamp, params.coast_timeout)
     it = expected(n, memory.acceleration(n), age, params)
-    return n._replace(stamp=n.stamp + age, position=it.position, velocity=it.velocity)
+    return n._replace(stamp=n.stamp + age, position=np.array(it.position),
+                      velocity=np.array(it.velocity))
 
 
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
@@ -165,18 +185,19 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
     soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
     approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
+    side = beside(soon.velocity, np.subtract(me.position, soon.position))
     return Loss(towards, me.position, float(towards @ n.position), approach,
-                float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
+                float(n.position[2]), side, n.name)
 
 
-def beside(velocity: Array, offset: Array) -> Array:
+def beside(velocity: Sequence[float], offset: Array) -> Array:
     """
     Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
 
     :param velocity: of the neighbour (3,), m/s.
     :param offset: own position minus the neighbour's (3,), m.
     """
-    x, y, _ = velocity.tolist()
+    x, y, _ = velocity
     length = math.hypot(x, y)
     if length < SHORTEST:
         return np.zeros(3)

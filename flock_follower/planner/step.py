@@ -109,7 +109,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     return memory, Decision(
         state, reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis,
-        retreat_velocity(memory, me, params), stamp,
+        retreat_velocity(memory, scene, params), stamp,
         command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
 
@@ -213,7 +213,7 @@ def _warnings(memory: Memory, scene: Scene, reason: str,
     if scene.state is State.TRACK:
         search = '' if leader is None else (
             f'looks for {leader.name}, last known {me.stamp - leader.stamp:.1f} s ago')
-        return (*filter(None, [reason, search]), *reports(memory, scene.neighbors, me, params))
+        return (*filter(None, [reason, search]), *reports(memory, scene.neighbors, params))
     retreated = 0.0 if memory.lost is None else memory.lost.retreated(me.position)
     if memory.lost is None or retreated < retreat(memory.lost, params) - 0.05:
         return ()

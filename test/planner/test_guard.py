@@ -26,11 +26,11 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.bounds import Edges, radial_bounds
+from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import Bound, COHESION, limit_command, SEPARATION
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.params import EDGE_RETURN_SPEED, GuardParams
+from flock_follower.planner.params import EDGE_RETURN_SPEED, Edges, GuardParams
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
 PARAMS = GuardParams()
@@ -108,7 +108,7 @@ def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_m
     rng = np.random.default_rng(seed)
     one = bounds([*rng.uniform(-2.0, 2.0, 2), 0.0], rng.uniform(-0.5, 0.5, 3))
     level = guard(a, v, ordered(one), A_MAX, 100.0, T).acceleration[:2]
-    n, most = one[0].normal[:2], math.sqrt(A_MAX ** 2 - a[2] ** 2)
+    n, most = np.array(one[0].normal[:2]), math.sqrt(A_MAX ** 2 - a[2] ** 2)
     lowest, highest = np.clip([one[0].least, -one[1].least], -most, most)
     radial = np.clip(n @ a[:2], lowest, highest)
     across = a[:2] - (n @ a[:2]) * n

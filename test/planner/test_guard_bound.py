@@ -23,10 +23,10 @@ import numpy as np
 import pytest
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.planner.bounds import Edges, radial_bounds
+from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.params import EDGE_RETURN_SPEED, GuardParams
+from flock_follower.planner.params import EDGE_RETURN_SPEED, Edges, GuardParams
 
 PARAMS = GuardParams()
 BAND = Edges.of(FlockingParams(beta=0.25, d1=8.0), PARAMS)

@@ -48,7 +48,7 @@ AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 def expected(position: Array, spread: float = 0.0, spreading: float = 0.0) -> Expected:
-    return Expected(position, np.zeros(3), np.zeros(3), spread, spreading)
+    return Expected(position.tolist(), STILL, STILL, spread, spreading, STILL)
 
 
 def pushed(bounds: Callable[[Array, Array], list[Bound]], pull: float = 2.0,

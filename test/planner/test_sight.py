@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
-from flown import Follower, own, seen
+from flown import Follower, own, seen, STILL
 from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
@@ -53,7 +53,7 @@ VIEW = FieldOfView.of_camera(info(), [0.0, 0.0, 0.0])
 
 
 def expected(position: Array, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Expected:
-    return Expected(position, np.array(velocity), np.zeros(3), 0.0, 0.0)
+    return Expected(position.tolist(), [*velocity], STILL, 0.0, 0.0, [*velocity])
 
 
 def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
