@@ -203,6 +203,7 @@ class Tracker:
         With one camera always; with several cameras, only if a neighbour may be in the image.
         """
         source = self.cameras[camera]
+        source.take_stamp(stamp)
         sought = self._sought(stamp, model, source)
         self._planned = stamp, source, sought
         return isinstance(sought, Missing) or bool(sought.near) or (
@@ -218,6 +219,7 @@ class Tracker:
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
+        self.cameras[camera].take_stamp(stamp)
         look = self._look(stamp, model, self.cameras[camera])
         if isinstance(look, Missing):
             return Sighting(rejections=[(look.value, '')])
@@ -232,7 +234,6 @@ class Tracker:
             if found is not None and not look.known(found, self._side[name]):
                 look.others.append(found)
         self._detect(image, look)
-        look.camera.processed = stamp
         if self._schedule.sweep_due(look.camera, stamp):
             self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
@@ -374,7 +375,7 @@ class Tracker:
         near = any(look.expected[name].pose is not None for name in look.missing
                    if name in look.near)
         camera.searched_near = near and not (due and camera.searched_near) and (
-            not self._schedule.has_time_for_all(camera, look.stamp))
+            not self._schedule.has_time_for_all(camera))
         if not look.missing or not due or camera.searched_near:
             return
         for _ in range(self._schedule.portions(camera, look.stamp)):

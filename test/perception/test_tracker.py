@@ -169,6 +169,22 @@ def test_whole_images_are_searched_in_portions_at_a_limited_rate(
     assert {stamps.count(stamp) for stamp in stamps[1:]} == {most}
 
 
+def test_a_track_that_is_lost_after_a_while_is_not_searched_for_in_all_portions_at_once(
+        monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
+    drone, searched = hovering(period=1.0 / 30.0), list[int]()
+    portion = search.portion
+
+    def counted(*arguments: Any) -> Any:
+        searched[-1] += 1
+        return portion(*arguments)
+
+    monkeypatch.setattr(search, 'portion', counted)
+    for seen in [image] * 15 + [EMPTY] * 12:
+        searched.append(0)
+        drone.see(seen)
+    assert searched[15:] == [0, 1] * 6
+
+
 def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
         monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
     drone, done, track = hovering(), list[bool](), tracker_module.track
