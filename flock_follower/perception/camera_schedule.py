@@ -137,6 +137,11 @@ class CameraSchedule:
         """Return whether the images come so rarely that one has time for all portions."""
         return camera.interval >= N_PORTIONS * PORTION_PERIOD
 
+    def missed_before(self, name: str, camera: MountedCamera, stamp: float) -> bool:
+        """Return whether a neighbor was missed in the image before that of a stamp, s."""
+        last = stamp + camera.time_offset.applied - camera.interval
+        return camera.vain.get(name, -math.inf) > last - 1e-3
+
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, although none is missing."""
         if camera.swept == -math.inf:

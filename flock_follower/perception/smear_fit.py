@@ -69,9 +69,9 @@ _MIN_FIT_LIKENESS = 0.95
 #: Least difference of white and black, grey levels.
 _MIN_CONTRAST = 10.0
 #: Most steps of a descent.
-_MAX_PASSES = 12
+_MAX_PASSES = 10
 #: First steps, in which that of the smear is halved.
-_DAMPED_PASSES = 3
+_DAMPED_PASSES = 2
 #: A step that turns by less, rad, may be the last.
 _LAST_TURN = 0.02
 #: A step of pose and smear that is shorter, cells, may be the last.
@@ -296,7 +296,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
             return None
         pose = moved(pose, at.center, step)
         residual = at.brightness - step.dot(at.design)
-        if count > 2 and turn < _LAST_TURN and max(offset / model.cell, smeared) < _LAST_SHIFT:
+        if count >= _DAMPED_PASSES and turn < _LAST_TURN and max(offset / model.cell, smeared) < _LAST_SHIFT:
             break
         squares = residual * residual
         variance = max(1.4826**2 * median(squares), _MIN_VARIANCE)
