@@ -126,14 +126,21 @@ class CameraSchedule:
 
     def portions(self, camera: MountedCamera, stamp: float) -> int:
         """Return how many portions of the image of a stamp, s, to search."""
-        if camera.searched == -math.inf:
-            return 1
-        waited = (abs(stamp - camera.searched) + 1e-3) / (self._cameras * PORTION_PERIOD)
-        return math.floor(min(waited, N_PORTIONS))
+        period = self._cameras * PORTION_PERIOD
+        if abs(stamp - camera.searched) + 1e-3 < period:
+            return 0
+        # Time before the last image is gone: what it did not search, this one does not make up.
+        fitting = 1.0 if camera.searched == -math.inf else (camera.interval + 1e-3) / period
+        return max(math.floor(min(fitting, N_PORTIONS)), 1)
 
-    def has_time_for_all(self, camera: MountedCamera, stamp: float) -> bool:
+    def has_time_for_all(self, camera: MountedCamera) -> bool:
         """Return whether the images come so rarely that one has time for all portions."""
-        return abs(stamp - camera.processed) >= N_PORTIONS * PORTION_PERIOD
+        return camera.interval >= N_PORTIONS * PORTION_PERIOD
+
+    def missed_before(self, name: str, camera: MountedCamera, stamp: float) -> bool:
+        """Return whether a neighbor was missed in the image before that of a stamp, s."""
+        last = stamp + camera.time_offset.applied - camera.interval
+        return camera.vain.get(name, -math.inf) > last - 1e-3
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, although none is missing."""

@@ -124,7 +124,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         len(found.lines.model.codes) == 1)
     if whole is None and blurred:
         whole = _fit_whole(image, camera, sought, _smear_starts(
-            image, camera, sought, expected.pose))
+            image, camera, sought, expected.pose, True))
     if whole is not None and (found is None or blurred):
         return _of_smears(image, camera, sought, whole, expected) if check_mirrored else (
             _with_doubt(sought, whole, last))
@@ -142,7 +142,7 @@ class _Whole(NamedTuple):
 def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
                 smeared: bool) -> tuple[EdgeFit | None, _Whole | None]:
     """Return fits to the edges and to a whole print up to two cells and a half from a pose."""
-    starts = _smear_starts(image, camera, sought, pose)
+    starts = _smear_starts(image, camera, sought, pose, smeared)
     if not starts and not smeared:
         return None, None
     whole = None
@@ -257,10 +257,10 @@ def _sharp(found: EdgeFit) -> bool:
     return found.inliers > SHARP_INLIERS and found.rms < SHARP_RMS
 
 
-def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target,
-                  pose: Transform) -> list[tuple[int, SmearStart]]:
+def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
+                  near: bool) -> list[tuple[int, SmearStart]]:
     """Return where the prints of the markers that face the camera resemble the image."""
-    found = ((k, seek(image, camera, sought.smears[k], pose))
+    found = ((k, seek(image, camera, sought.smears[k], pose, near))
              for k in np.flatnonzero(facing(sought.model, pose)).tolist())
     return [(k, start) for k, start in found if start is not None]
 

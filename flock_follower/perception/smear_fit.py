@@ -31,11 +31,11 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from flock_follower.geometry import Array, skew, Transform
+from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import (
-    cross,
     moved,
     normal_covariance,
     solve_normal,
@@ -47,35 +47,59 @@ from flock_follower.perception.smear_print import (
     instants_of,
     LENS_BLURS,
     N_FOCUSED,
+    NEAR_REACH,
     SAMPLES_PER_CELL,
     SEARCH_REACH,
     smear_print,
     SmearModel,
 )
 
-_LENS = 0.75  # px: blur there is without motion
-_AROUND = 0.8  # cells that are white beyond the black border, at least
-_LONGEST = 2.4  # cells that motion smears by
-_LIKENESS = 0.7  # least correlation from which to start,
-_RARER = 0.02  # by so much likelier it must be that it is out of focus
-_ALIKE = 0.95  # and of the fit
-_MIN_CONTRAST = 10.0  # grey levels
-_PASSES = 12
-_DAMPED = 3  # of them with steps of the smear halved
-_SMALL = 0.02  # rad, and ten times as many cells: a shorter step is the last, but for the first
-_LONGEST_TURN = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
-_LONGEST_STEP = 0.5  # and so does one by this share of the distance
-_MIN_INSIDE = 0.8  # share of the samples that must be in the image
-_BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
-_FLOOR = 1.0  # grey levels: least standard deviation of a sample
-_ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
-#: Of the pose (6), the response (6) and the smear (2); a smear of 0 leaves the last open.
-_PRIOR = np.diag([0.0] * 12 + [1.0, 1.0])
-#: By so much of the contrast (1 sigma) the response is bent further, and light falls unevenly.
-_UNEVEN = 0.1
-#: By more of the contrast light does not fall off across a marker: the most measured is 0.15.
-_STEEPEST = 0.4
-_REGULAR = np.diag([0.0] * 9 + [_UNEVEN**-2] * 3 + [0.0, 0.0])
+#: Blur without motion, px (1 sigma).
+_LENS_BLUR = 0.75
+#: White beyond the black border, at least, cells.
+_WHITE_AROUND = 0.8
+#: Longest smear by motion, cells.
+_MAX_SMEAR = 2.4
+#: Least correlation of image and print from which to descend.
+_MIN_LIKENESS = 0.7
+#: Correlation by which a defocused print must win.
+_DEFOCUS_PENALTY = 0.02
+#: Least correlation of image and print at the end.
+_MIN_FIT_LIKENESS = 0.95
+#: Least difference of white and black, grey levels.
+_MIN_CONTRAST = 10.0
+#: Most steps of a descent.
+_MAX_PASSES = 10
+#: First steps, in which that of the smear is halved.
+_DAMPED_PASSES = 2
+#: A step that turns by less, rad, may be the last.
+_LAST_TURN = 0.02
+#: A step of pose and smear that is shorter, cells, may be the last.
+_LAST_SHIFT = 0.2
+#: A step that turns by more, rad, or smears by more, cells, leads nowhere.
+_MAX_TURN = 1.0
+#: A step that is longer than this share of the distance leads nowhere.
+_MAX_OFFSET = 0.5
+#: Least depth of a sample, m.
+_MIN_DEPTH = 0.05
+#: Least share of the samples that are in the image.
+_MIN_INSIDE = 0.8
+#: Error of the blur of lens and print, cells (1 sigma).
+_BLUR_ERROR = 0.05
+#: Least variance of a sample, squared grey levels.
+_MIN_VARIANCE = 1.0
+#: Samples whose errors count as one: within a cell they err alike.
+_ALIKE_SAMPLES = 1.5
+#: Added to normal equations of the response, samples: they stay definite.
+_RIDGE = 1e-9 * np.eye(6)
+#: Prior of the pose (6), the response (6) and the smear (2): a smear of 0 leaves the last open.
+_PRIOR_INFORMATION = np.diag([0.0] * 12 + [1.0, 1.0])
+#: Further bend of the response and uneven light, share of the contrast (1 sigma).
+_UNEVEN_LIGHT = 0.1
+#: Most fall-off of light across a marker, share of the contrast: the most measured is 0.15.
+_MAX_FALL_OFF = 0.4
+#: Prior of the bend of the response and of the fall-off of light, times the squared contrast.
+_REGULAR_INFORMATION = np.diag([0.0] * 9 + [_UNEVEN_LIGHT**-2] * 3 + [0.0, 0.0])
 
 
 class SmearStart(NamedTuple):
@@ -121,52 +145,99 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
 
 
 def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
-         start: Transform) -> SmearStart | None:
+         start: Transform, near: bool = False) -> SmearStart | None:
     """
     Return the pose, shifted, smear and blur with which the print is likest to the image.
 
     ``start`` may be off by two cells and a half. None if the image resembles the print nowhere.
+
+    :param near: whether ``start`` is probably off by less than a cell: a search there is cheaper.
     """
-    seen = _look(image, camera, start.apply(
-        model.origin + model.around @ model.axes)) if within_reason(start) else None
+    if not within_reason(start):
+        return None
+    found = _seek_within(image, camera, model, start, NEAR_REACH) if near else None
+    return found or _seek_within(image, camera, model, start, SEARCH_REACH)
+
+
+def _seek_within(image: GrayImage, camera: CameraModel, model: SmearModel, start: Transform,
+                 reach: int) -> SmearStart | None:
+    """Return what :func:`seek` does; of a shorter reach than the longest none at its rim."""
+    seen = _look(image, camera, _basis(start, model), model.around[reach])
     if seen is None:
         return None
-    brightness, _ = seen
-    size = math.isqrt(len(brightness))
-    shown = brightness.reshape(size, size).astype(np.float32)
-    likeness = np.stack([cv2.matchTemplate(shown, smeared, cv2.TM_CCOEFF_NORMED)
-                         for smeared in model.smeared])
-    likeness[~np.isfinite(likeness)] = 0.0
-    likeness[[lens >= N_FOCUSED for lens in model.lenses]] -= _RARER
-    which, row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
-    if not likeness[which, row, column] > _LIKENESS:
+    likeness = _likeness(seen.brightness, model)
+    likeness[:, [lens >= N_FOCUSED for lens in model.lenses]] -= _DEFOCUS_PENALTY
+    place, which = divmod(int(likeness.argmax()), len(model.lenses))
+    if not likeness[place, which] > _MIN_LIKENESS:
         return None
-    shift = (np.array([column, row]) - SEARCH_REACH) / SAMPLES_PER_CELL
-    offset = start.rotation @ (shift @ model.axes)
+    row, column = divmod(place, 2 * reach + 1)
+    steps = np.array([column, row]) - reach
+    if reach < SEARCH_REACH and np.abs(steps).max() == reach:
+        return None
+    offset = start.rotation @ (steps / SAMPLES_PER_CELL @ model.axes)
     pose = Transform(start.rotation, start.translation + offset)
     return SmearStart(pose, model.smears[which], model.lenses[which])
 
 
-def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, Any] | None:
-    """Return the brightness (s,) at points (s, 3), m, and which are in the image; None if few."""
-    if not points[:, 2].min() > 0.05:
+def _likeness(brightness: Array, model: SmearModel) -> Array:
+    """Return the correlation of each place, row by row, with each smeared print, (p, t)."""
+    size = math.isqrt(len(brightness))
+    shown = (brightness - brightness.mean()).astype(np.float32).reshape(size, size)
+    side = math.isqrt(model.smeared.shape[1])
+    patches = sliding_window_view(shown, (side, side)).reshape(-1, side * side)
+    mean = patches.mean(axis=1)
+    spread = np.einsum('ps,ps->p', patches, patches) - side * side * mean * mean
+    # A smeared print has mean 0 and norm 1.
+    found: Array = patches.dot(model.smeared.T) / np.sqrt(np.maximum(spread, 1.0))[:, None]
+    return found
+
+
+class _Seen(NamedTuple):
+    """
+    The brightness of samples in an image, (s,), grey levels.
+
+    ``inside`` (s,), bool: which are in the image; None if all are.
+    """
+
+    brightness: Array
+    inside: Any
+
+
+def _basis(pose: Transform, model: SmearModel) -> Array:
+    """Return a step to the right, one down, and the place (0, 0), (3, 3), m, as columns."""
+    basis = np.empty((3, 3))
+    basis[:, :2] = pose.rotation.dot(model.axes.T)
+    basis[:, 2] = pose.rotation.dot(model.origin) + pose.translation
+    return basis
+
+
+def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) -> _Seen | None:
+    """Return what an image shows at places (3, s) on a marker; None if too few are in it."""
+    points = places.T.dot(basis.T)
+    if not points[:, 2].min() > _MIN_DEPTH:
         return None
     pixels = camera.project(points)
-    if not np.isfinite(pixels).all():
-        return None
+    x, y = pixels.T.copy()
+    left, top, right, bottom = x.min(), y.min(), x.max(), y.max()
+    inside: Any = None
+    # Written so that NaN is outside.
+    if not (left >= 0.0 and top >= 0.0 and right <= camera.width - 1
+            and bottom <= camera.height - 1):
+        if not np.isfinite(pixels).all():
+            return None
+        inside = ((pixels >= 0.0) & (pixels <= (camera.width - 1, camera.height - 1))).all(axis=1)
+        if np.count_nonzero(inside) < _MIN_INSIDE * len(inside):
+            return None
     brightness = cv2.remap(image, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR,
                            borderMode=cv2.BORDER_REPLICATE).ravel()
-    inside: Any = ((pixels >= 0.0) & (pixels <= (camera.width - 1, camera.height - 1))).all(axis=1)
-    if np.count_nonzero(inside) < _MIN_INSIDE * len(inside):
-        return None
-    return brightness.astype(float), inside
+    return _Seen(brightness.astype(float), inside)
 
 
 class _Linear(NamedTuple):
     """
     The print at a pose and a smear, and by how much its samples, (s,), change with each unknown.
 
-    ``design`` (s, 14), grey levels per unit of the pose (6), the response (6) and the smear (2);
+    ``design`` (14, s), grey levels per unit of the pose (6), the response (6) and the smear (2);
     ``steep`` (s,), grey levels squared, of how well blur is known. ``usable`` (s,), bool: samples
     in the image that show the marker; ``center`` (3,), m, is about which it turns. ``light``:
     difference between white and black, grey levels.
@@ -184,7 +255,7 @@ class _Descent(NamedTuple):
     """
     Residuals, (s,), grey levels, after a step, and the inputs of the step.
 
-    ``light``: difference between white and black; ``response`` (s, 6) to whiteness.
+    ``light``: difference between white and black; ``response`` (6, s) to whiteness.
     """
 
     residual: Array
@@ -199,42 +270,44 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
             start: SmearStart) -> SmearFit | None:
     """Return the fit at the least weighted squares near a pose and a smear."""
     pose, smear, lens = start
-    weights, variance, response = np.ones(len(model.places)), _FLOOR**2, None
-    for count in range(_PASSES):
+    weights, variance, response = np.ones(model.places.shape[1]), _MIN_VARIANCE, None
+    for count in range(_MAX_PASSES):
         lens = _lens_of(camera, model, pose, lens)
         at = _linearize(image, camera, model, SmearStart(pose, smear, lens), response)
         if at is None:
             return None
         # The steeper it is, the more the true blur of lens and cells matters.
         weights = weights * at.usable / (variance + at.steep)
-        weighted = at.design * weights[:, None]
-        information = weighted.T.dot(at.design) + _PRIOR + (
-            _REGULAR / max(at.light, _MIN_CONTRAST)**2)
+        weighted = at.design * weights
+        information = weighted.dot(at.design.T) + _PRIOR_INFORMATION + (
+            _REGULAR_INFORMATION / max(at.light, _MIN_CONTRAST)**2)
         # Smears to either side of an axis look alike: a whole step from one leads to the other.
-        held = information + information * _PRIOR if count < _DAMPED else information
-        step = solve_normal(held, weighted.T.dot(at.brightness))
+        held = information + information * _PRIOR_INFORMATION if count < _DAMPED_PASSES else (
+            information)
+        step = solve_normal(held, weighted.dot(at.brightness))
         if step is None:
             return None
         response = step[6:9].tolist()
-        turn, offset = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
-        smear, smeared = smear + step[-2:], float(np.abs(step[-2:]).max())
-        if (not max(turn, smeared) < _LONGEST_TURN or response[0] <= 0.0
-                or offset > _LONGEST_STEP * at.center[2] or math.hypot(*smear) > _LONGEST):
+        turn, offset = max(map(abs, step[3:6].tolist())), max(map(abs, step[:3].tolist()))
+        smear, smeared = smear + step[-2:], max(map(abs, step[-2:].tolist()))
+        if (not max(turn, smeared) < _MAX_TURN or response[0] <= 0.0
+                or offset > _MAX_OFFSET * at.center[2]
+                or math.hypot(*smear.tolist()) > _MAX_SMEAR):
             return None
         pose = moved(pose, at.center, step)
-        residual = at.brightness - at.design.dot(step)
-        if count > 2 and turn < _SMALL and max(offset / model.cell, smeared) < 10.0 * _SMALL:
+        residual = at.brightness - step.dot(at.design)
+        if count >= _DAMPED_PASSES and turn < _LAST_TURN and max(offset / model.cell, smeared) < _LAST_SHIFT:
             break
         squares = residual * residual
-        variance = max(1.4826**2 * median(squares), _FLOOR**2)
+        variance = max(1.4826**2 * median(squares), _MIN_VARIANCE)
         weights = np.maximum(1.0 - squares / (25.0 * (variance + at.steep)), 0.0)**2
     else:
         return None
-    if math.hypot(*step[10:12].tolist()) > _STEEPEST * response[0]:
+    if math.hypot(*step[10:12].tolist()) > _MAX_FALL_OFF * response[0]:
         return None
-    columns = at.design[:, 6:12]
+    rows = at.design[6:12]
     return _checked(model, SmearStart(pose, smear, lens), _Descent(
-        residual, columns.dot(step[6:12]), weights, information, response[0], columns))
+        residual, step[6:12].dot(rows), weights, information, response[0], rows))
 
 
 def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int) -> int:
@@ -242,7 +315,7 @@ def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int)
     if lens >= N_FOCUSED:
         return lens
     depth = float(pose.apply(model.middle[None])[0, 2])
-    blur = _LENS * depth / (camera.matrix[0, 0] * model.cell)
+    blur = _LENS_BLUR * depth / (camera.matrix[0, 0] * model.cell)
     return int(np.abs(LENS_BLURS[:N_FOCUSED] - blur).argmin())
 
 
@@ -255,45 +328,61 @@ def _linearize(image: GrayImage, camera: CameraModel, model: SmearModel, start: 
         are fitted to the image.
     """
     pose, smear, lens = start
-    points, center = pose.apply(model.on_body), pose.apply(model.middle[None])[0]
-    seen = _look(image, camera, points)
+    basis = _basis(pose, model)
+    seen = _look(image, camera, basis, model.places)
     if seen is None:
         return None
-    brightness, inside = seen
-    # What lies beyond the white around the marker is smeared into its rim.
-    usable = inside & (model.from_middle + 0.5 * np.abs(smear) < 0.5 * model.cells + _AROUND
-                       ).all(axis=1)
-    white, by_place, by_smear = smear_print(
-        model.printed[lens], model.places, smear, LENS_BLURS[lens])
-    design = np.empty((len(white), 14))
+    (white, right, down), by_smear = smear_print(
+        model.printed[lens], model.texels, smear, LENS_BLURS[lens])
+    design = np.empty((14, len(white)))
     # Gamma and over-exposure bend what would be straight; light falls unevenly.
-    bent = white * (1.0 - white)
-    design[:, 6], design[:, 7], design[:, 8] = white, 1.0, bent
-    design[:, 9] = bent * (1.0 - 2.0 * white)
-    design[:, 10:12] = white[:, None] * model.across
+    steepness = 1.0 - 2.0 * white
+    design[6], design[7], design[8] = white, 1.0, white * (1.0 - white)
+    np.multiply(design[8], steepness, out=design[9])
+    np.multiply(model.across, white, out=design[10:12])
     if response is None:
-        columns = design[:, 6:12]
-        first = solve_normal(columns.T.dot(columns), columns.T.dot(brightness))
+        rows = design[6:12]
+        first = solve_normal(rows.dot(rows.T), rows.dot(seen.brightness))
         if first is None:
             return None
         response = first[:3].tolist()
-    slope = (response[0] + response[2] * (1.0 - 2.0 * white))[:, None]
-    by_place = slope * by_place
-    design[:, :3] = _by_point(pose, model, points, by_place)
-    design[:, 3:6] = cross(points - center, design[:, :3])
-    design[:, 12:] = slope * by_smear
-    steep = _BLURRED**2 * (by_place * by_place).sum(axis=1)
-    return _Linear(brightness, usable, design, steep, center, response[0])
+    slope = response[0] + response[2] * steepness
+    right, down = slope * right, slope * down
+    center = pose.apply(model.middle[None])[0]
+    _by_pose(basis, model.places, center, right, down, design)
+    np.multiply(slope, by_smear, out=design[12:])
+    return _Linear(seen.brightness, _usable(model, seen, smear), design,
+                   _BLUR_ERROR**2 * (right * right + down * down), center, response[0])
 
 
-def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array) -> Array:
-    """Return by how much brightness grows as points (s, 3) move, per m, from that per cell."""
-    right, down = (skew(axis) for axis in model.axes @ pose.rotation.T)
-    # As the marker moves by v, at a pixel is the place r, d before: v = r right + d down + ray.
-    across = points.dot(right.dot(down[[2, 0, 1], [1, 2, 0]]))
-    moved_by: Array = (by_place[:, 1:] * points.dot(right.T)
-                       - by_place[:, :1] * points.dot(down.T)) / across[:, None]
-    return moved_by
+def _usable(model: SmearModel, seen: _Seen, smear: Array) -> Any:
+    """Return which samples show the marker: what is beyond its white is smeared into the rim."""
+    across, along = (0.5 * model.cells + _WHITE_AROUND - 0.5 * np.abs(smear)).tolist()
+    usable = (model.from_middle[0] < across) & (model.from_middle[1] < along)
+    return usable if seen.inside is None else usable & seen.inside
+
+
+def _by_pose(basis: Array, places: Array, center: Array, right: Array, down: Array,
+             design: Array) -> None:
+    """
+    Set by how much brightness grows as the marker moves, per m, and turns, per rad, ``design``.
+
+    :param right, down: by how much it grows per cell, (s,).
+    """
+    # The place u r + v d + o is seen at a pixel. As the marker moves by m, that shows the place
+    # before by u (c . m) - a . m, v (c . m) - b . m; a, b, c are the rows of the inverse.
+    along = np.empty((3, len(right)))
+    np.negative(right, out=along[0])
+    np.negative(down, out=along[1])
+    np.multiply(places[0], right, out=along[2])
+    along[2] += places[1] * down
+    x, y, z = np.dot(np.linalg.inv(basis).T, along, out=design[:3])
+    middle = basis.copy()
+    middle[:, 2] -= center
+    arm_x, arm_y, arm_z = middle.dot(places)
+    design[3] = arm_y * z - arm_z * y
+    design[4] = arm_z * x - arm_x * z
+    design[5] = arm_x * y - arm_y * x
 
 
 def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | None:
@@ -302,10 +391,10 @@ def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | N
     shown = last.fitted + last.residual
     spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))
     left = float(weights.dot(last.residual**2))
-    if (contrast < _MIN_CONTRAST or not left < (1.0 - _ALIKE**2) * spread
+    if (contrast < _MIN_CONTRAST or not left < (1.0 - _MIN_FIT_LIKENESS**2) * spread
             or not _shows_code(model, end, last)):
         return None
-    chi2 = max(left / max(np.count_nonzero(weights) - len(_PRIOR), 1), 1.0)
+    chi2 = max(left / max(np.count_nonzero(weights) - len(_PRIOR_INFORMATION), 1), 1.0)
     covariance = normal_covariance(last.information / (chi2 * _ALIKE_SAMPLES))
     if covariance is None:
         return None
@@ -315,22 +404,23 @@ def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | N
 
 def _shows_code(model: SmearModel, end: SmearStart, last: _Descent) -> bool:
     """Return whether no word suits the image better, and few cells were better turned."""
-    instants = instants_of(end.smear, LENS_BLURS[end.lens])
-    at = np.rint(model.places + instants[:, None, None] * end.smear).astype(int)
-    inner, count = model.cells - 2, len(model.places)
-    within = ((at >= 1) & (at <= inner)).all(axis=2)
-    cell = (at[..., 1] - 1) * inner + at[..., 0] - 1
-    index = cell * count + np.arange(count)
+    instants = instants_of(end.smear, LENS_BLURS[end.lens])[:, None]
+    inner, count = model.cells - 2, model.places.shape[1]
+    column, row = (np.rint(place + instants * along).astype(np.intp)
+                   for place, along in zip(model.places, end.smear.tolist()))
+    within = (column >= 1) & (column <= inner) & (row >= 1) & (row <= inner)
+    index = ((row - 1) * inner + column - 1) * count + np.arange(count)
     share = np.bincount(index[within], minlength=inner * inner * count).reshape(
-        inner * inner, count) / len(instants)  # of each sample, how much is of each cell
-    own = model.codes[0]
-    turned = (1.0 - 2.0 * own)[:, None] * share * last.light
+        inner * inner, count)  # of each sample, in how many instants it is of each cell
+    turned = share * ((1.0 - 2.0 * model.bits) * (last.light / len(instants)))[:, None]
     # What turning cells adds to the squares left, once the response is fitted anew.
-    basis = np.linalg.qr(last.response)[0]
-    turned = turned - turned.dot(basis).dot(basis.T)
-    by_residual, together = turned.dot(last.residual), turned.dot(turned.T)
+    response, residual = last.response, last.residual
+    by_response = turned.dot(response.T)
+    refit = np.linalg.solve(response.dot(response.T) + _RIDGE, by_response.T).T
+    by_residual = turned.dot(residual) - refit.dot(response.dot(residual))
+    together = turned.dot(turned.T) - refit.dot(by_response.T)
     if np.count_nonzero(together.diagonal() <= 2.0 * by_residual) > model.errors:
         return False
-    flips = np.abs(model.codes[1:] - own)
-    added = (flips.dot(together) * flips).sum(axis=1) - 2.0 * flips.dot(by_residual)
+    added = (model.flips.dot(together) * model.flips).sum(axis=1) - (
+        2.0 * model.flips.dot(by_residual))
     return bool((added > 0.0).all())

@@ -37,10 +37,12 @@ from flock_follower.perception.print_model import cell_code
 
 #: Samples per cell, along rows and along columns.
 SAMPLES_PER_CELL = 3
-#: Cells beyond the black border that are sampled.
-MARGIN_CELLS = 1
+#: Samples beyond the black border.
+MARGIN = 1
 #: Samples from the expected place of a marker up to which it is searched for.
 SEARCH_REACH = 8
+#: The same for a marker that was smeared in the last image, too.
+NEAR_REACH = 3
 #: Motion per instant of the exposure at most, in standard deviations of the blur without motion:
 #: with more, the instants would show as steps.
 _STEP = 1.6
@@ -69,16 +71,17 @@ class SmearModel:
     The model of a print whose image is smeared by motion.
 
     ``origin`` (3,) and ``axes`` (2, 3), m: place of (0, 0) on the body, and steps of one cell.
-    ``places`` (s, 2), cells, are the sample points, row by row; ``around`` are more of them.
-    ``on_body`` (s, 3), m: ``places`` on the body; ``middle`` (3,) of the marker; ``from_middle``
-    (s, 2), cells, how far off ``places`` are; ``across`` (s, 2) is -0.5 to 0.5 across the marker.
+    ``places`` (3, s) are the sample points, row by row: column and row, cells, and 1; ``texels``
+    (2, s) are the same in texels. ``around`` are more sample points, (3, a), by the samples that
+    they reach beyond. ``middle`` (3,) of the marker on the body; ``from_middle`` (2, s), cells:
+    how far off it ``places`` are; ``across`` (2, s) is -0.5 to 0.5 across the marker.
     ``cell``, m, is the length of a cell.
     ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
     for each of :data:`LENS_BLURS`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
-    ``smeared`` (t, k, k) the samples under them. ``codes`` (w, b): all codewords of the dictionary
-    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread: half of
-    those that can be corrected.
+    ``smeared`` (t, s) the samples under them, of mean 0 and norm 1. ``bits`` (b,), 0..1: the inner cells. ``flips``
+    (w, b) is 1 for each cell in which another codeword, in any rotation, differs from them; up to
+    ``errors`` cells may be misread: half of those that can be corrected.
     ``cells``: number of cells along a side, with the black border.
     """
 
@@ -90,12 +93,14 @@ class SmearModel:
             0.5 * (n - 1) * cell * np.array([[-1.0, 1.0, 0.0]]))[0]
         self.axes = cell * np.array([R[:, 0], -R[:, 1]])
         self.cell = cell
-        self.places = _samples(n, MARGIN_CELLS)
-        self.around = _samples(n, MARGIN_CELLS + SEARCH_REACH)
-        self.on_body = self.origin + self.places @ self.axes
+        self.places = _samples(n, MARGIN)
+        self.texels: Any = (
+            (self.places[:2] + 0.5 + _WHITE_CELLS) * _TEXELS_PER_CELL - 0.5).astype(np.float32)
+        self.around = {reach: _samples(n, MARGIN + reach)
+                       for reach in (NEAR_REACH, SEARCH_REACH)}
         self.middle = self.origin + 0.5 * (n - 1) * self.axes.sum(axis=0)
-        self.from_middle = np.abs(self.places - 0.5 * (n - 1))
-        self.across = self.places / (n - 1) - 0.5
+        self.from_middle = np.abs(self.places[:2] - 0.5 * (n - 1))
+        self.across = self.places[:2] / (n - 1) - 0.5
         white = np.pad(printed, _WHITE_CELLS, constant_values=True).astype(float)
         level = np.kron(white, np.ones((_TEXELS_PER_CELL, _TEXELS_PER_CELL)))
         self.printed: Any = np.array([_with_slopes(cv2.GaussianBlur(
@@ -107,13 +112,15 @@ class SmearModel:
                                 *np.zeros((len(LENS_BLURS) - N_FOCUSED, 2))])
         self.lenses = (_FIRST_LENS,) * (len(_LENGTHS) * len(angles)) + tuple(
             range(N_FOCUSED, len(LENS_BLURS)))
-        size = n * SAMPLES_PER_CELL + 2 * MARGIN_CELLS
         self.smeared: Any = np.array([
-            smear_print(self.printed[lens], self.places, smear, LENS_BLURS[lens])[0]
-            for lens, smear in zip(self.lenses, self.smears)]).reshape(-1, size, size).astype(
-                np.float32)
+            smear_print(self.printed[lens], self.texels, smear, LENS_BLURS[lens])[0][0]
+            for lens, smear in zip(self.lenses, self.smears)])
+        self.smeared -= self.smeared.mean(axis=1, keepdims=True)
+        self.smeared /= np.linalg.norm(self.smeared, axis=1, keepdims=True)
+        self.smeared = self.smeared.astype(np.float32)
         code = cell_code(marker, dictionary)
-        self.codes = 0.5 + 0.5 * np.vstack([code.bits, code.others])
+        self.bits = 0.5 + 0.5 * code.bits.astype(float)
+        self.flips = np.abs(0.5 * (code.others - code.bits)).astype(float)
         self.errors = max(code.errors // 2, 1)
 
 
@@ -128,25 +135,28 @@ def _with_slopes(level: Array) -> Any:
 
 
 def _samples(cells: int, margin: int) -> Array:
-    """Return places (s, 2), cells, that cover a marker and a margin, samples, around it."""
+    """Return places (3, s), cells, and 1, that cover a marker and a margin, samples, around it."""
     along = (np.arange(-margin, cells * SAMPLES_PER_CELL + margin) + 0.5) / SAMPLES_PER_CELL - 0.5
-    return np.stack(np.meshgrid(along, along), axis=2).reshape(-1, 2)
+    columns, rows = np.meshgrid(along, along)
+    return np.array([columns.ravel(), rows.ravel(), np.ones(columns.size)])
 
 
-def smear_print(printed: Any, places: Array, smear: Array,
-                lens: float) -> tuple[Array, Array, Array]:
+def smear_print(printed: Any, texels: Any, smear: Array, lens: float) -> tuple[Array, Array]:
     """
-    Return how white samples are, (s,), and by place and by smear, (s, 2), per cell.
+    Return whiteness, and its derivatives per cell to the right and down, of samples, (3, s).
 
+    Then by how much whiteness grows per cell of the smear, (2, s).
+
+    :param texels: where the samples are in the print, (2, s), texels.
     :param lens: the blur of the print, cells.
     """
     instants = instants_of(smear, lens)
-    at = places + instants[:, None, None] * smear
-    at = ((at + 0.5 + _WHITE_CELLS) * _TEXELS_PER_CELL - 0.5).astype(np.float32)
-    seen = cv2.remap(printed, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
-                     borderMode=cv2.BORDER_REPLICATE).reshape(len(instants), -1)
-    mean, by_smear = _means(len(instants)).dot(seen).reshape(2, -1, 3).astype(float)
-    return mean[:, 0], mean[:, 1:], by_smear[:, 1:]
+    step_x, step_y = (_TEXELS_PER_CELL * instants[:, None] * smear[None]).astype(np.float32).T
+    seen = cv2.remap(printed, texels[0] + step_x[:, None], texels[1] + step_y[:, None],
+                     cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    mean, by_smear = _means(len(instants)).dot(seen.reshape(len(instants), -1)).reshape(2, -1, 3)
+    return (np.array(mean.T, dtype=float, order='C'),
+            np.array(by_smear.T[1:], dtype=float, order='C'))
 
 
 def instants_of(smear: Array, lens: float) -> Array:

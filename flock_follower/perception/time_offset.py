@@ -200,8 +200,10 @@ class MountedCamera:
         """Stamps of the last whole images searched, s: for a missing neighbour; although none."""
         self.vain: dict[str, float] = {}
         """When a neighbour was last looked for without success, by the odometry's clock, s."""
-        self.processed = -math.inf
-        """Stamp of the last image, s."""
+        self.newest = -math.inf
+        """Stamp of the newest image, s."""
+        self.interval = math.inf
+        """Time from the image before to the newest, s."""
         self.searched_near = False
         """Whether the last image was searched thoroughly near an expected place, and no more."""
         self.portion = 0
@@ -212,3 +214,8 @@ class MountedCamera:
         """Stamp of the last image in which a neighbor was measured by more than its smear, s."""
         self.measured: dict[str, Measurement] = {}
         """The last measurement of each neighbor."""
+
+    def take_stamp(self, stamp: float) -> None:
+        """Take that an image of a stamp, s, is there: once or several times."""
+        if stamp != self.newest:
+            self.newest, self.interval = stamp, abs(stamp - self.newest)

@@ -77,8 +77,10 @@ from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 MARGIN = 100.0
 #: Images from one fit of the mirrored attitude to the next, otherwise.
 MIRRORED_EVERY = 30
-#: Images from one fit of the mirrored attitude of a smeared print to the next.
+#: Images from one fit of the mirrored attitude of a smeared print to the next, if it is settled.
 SMEARED_EVERY = 3
+#: The same if it is not settled: an image has no time for both in turn.
+UNSETTLED_EVERY = 2
 #: Probability of the mirrored attitude below which the other one is settled.
 SETTLED = 0.05
 #: Of a pose that another detector measured: it comes without an image.
@@ -203,6 +205,7 @@ class Tracker:
         With one camera always; with several cameras, only if a neighbour may be in the image.
         """
         source = self.cameras[camera]
+        source.take_stamp(stamp)
         sought = self._sought(stamp, model, source)
         self._planned = stamp, source, sought
         return isinstance(sought, Missing) or bool(sought.near) or (
@@ -218,6 +221,7 @@ class Tracker:
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
+        self.cameras[camera].take_stamp(stamp)
         look = self._look(stamp, model, self.cameras[camera])
         if isinstance(look, Missing):
             return Sighting(rejections=[(look.value, '')])
@@ -232,7 +236,6 @@ class Tracker:
             if found is not None and not look.known(found, self._side[name]):
                 look.others.append(found)
         self._detect(image, look)
-        look.camera.processed = stamp
         if self._schedule.sweep_due(look.camera, stamp):
             self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
@@ -339,7 +342,7 @@ class Tracker:
             return MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
         settled = found.doubt < SETTLED and expected.pose is not None and (
             angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
-        return SMEARED_EVERY - 1 if settled else 0
+        return (SMEARED_EVERY if settled else UNSETTLED_EVERY) - 1
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""
@@ -361,7 +364,13 @@ class Tracker:
         """Look for the neighbours that are not measured yet."""
         camera, dictionary = look.camera, self.config.dictionary
         due = self._schedule.search_due(camera, look.stamp)
-        for thorough in (False, True):
+        rare = self._schedule.has_time_for_all(camera)
+        # The fits to edges and to a smear took the time of the first image without a neighbor.
+        hurried = not rare and all(
+            look.expected[name].pose is not None and name in look.near
+            and not self._schedule.missed_before(name, camera, look.stamp)
+            for name in look.missing)
+        for thorough in (False,) if hurried else (False, True):
             for name in [n for n in look.near if n not in look.measured and (
                     not thorough or n in look.anywhere)]:
                 pose = look.expected[name].pose
@@ -373,9 +382,8 @@ class Tracker:
         # Unless images are rare, one has time for a thorough search near by, or for a portion.
         near = any(look.expected[name].pose is not None for name in look.missing
                    if name in look.near)
-        camera.searched_near = near and not (due and camera.searched_near) and (
-            not self._schedule.has_time_for_all(camera, look.stamp))
-        if not look.missing or not due or camera.searched_near:
+        camera.searched_near = near and not (due and camera.searched_near or hurried or rare)
+        if not look.missing or not due or camera.searched_near or hurried:
             return
         for _ in range(self._schedule.portions(camera, look.stamp)):
             if look.missing:

@@ -142,12 +142,25 @@ def test_the_cheapest_stage_that_finds_the_neighbour_is_used(image: GrayImage) -
 
 
 @pytest.mark.parametrize(('period', 'stages'), [
-    (1 / 30, ['roi', 'full', 'roi', 'full']), (0.2, ['full'] * 4)])
+    (1 / 30, ['near', 'near+', 'full', 'near+', 'full']), (0.2, ['full'] * 4)])
 def test_the_search_near_takes_turns_with_portions_unless_images_are_rare(
-        image: GrayImage, period: float, stages: list[str]) -> None:
-    drone = hovering(period=period)
+        monkeypatch: pytest.MonkeyPatch, image: GrayImage, period: float,
+        stages: list[str]) -> None:
+    drone, thorough = hovering(period=period), list[bool]()
+    near = search.near
+
+    def watched(*arguments: Any) -> Any:
+        thorough.append(arguments[5])
+        return near(*arguments)
+
+    monkeypatch.setattr(search, 'near', watched)
     drone.see(image)
-    assert [drone.see(EMPTY).stage for _ in stages] == stages
+    done = []
+    for _ in stages:
+        thorough.clear()
+        stage = drone.see(EMPTY).stage
+        done.append('full' if stage == 'full' else 'near+' if True in thorough else 'near')
+    assert done == stages
 
 
 @pytest.mark.parametrize(('rate', 'every', 'most'), [(60.0, 2, 1), (30.0, 1, 1), (7.0, 1, 4)])
@@ -167,6 +180,22 @@ def test_whole_images_are_searched_in_portions_at_a_limited_rate(
     assert [number for _, number in done] == [k % search.N_PORTIONS for k in range(len(done))]
     stamps = [stamp for stamp, _ in done]
     assert {stamps.count(stamp) for stamp in stamps[1:]} == {most}
+
+
+def test_a_track_that_is_lost_after_a_while_is_not_searched_for_in_all_portions_at_once(
+        monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
+    drone, searched = hovering(period=1.0 / 30.0), list[int]()
+    portion = search.portion
+
+    def counted(*arguments: Any) -> Any:
+        searched[-1] += 1
+        return portion(*arguments)
+
+    monkeypatch.setattr(search, 'portion', counted)
+    for seen in [image] * 15 + [EMPTY] * 12:
+        searched.append(0)
+        drone.see(seen)
+    assert searched[15:] == [0] + [0, 1] * 5 + [0]
 
 
 def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
