@@ -359,7 +359,7 @@ class Evaluation(Listener):
 
     def _moved(self, state: OdometryState) -> OdometryState:
         """Return a state with its stamp as if the bag had no gaps."""
-        return state._replace(stamp=state.stamp - self._skipped_ns)
+        return state._replace(stamp=state.stamp - self._skipped_ns) if self._skipped_ns else state
 
     def truth(self, state: OdometryState, own: bool) -> None:
         """Take the true state of the follower, or of a neighbor."""

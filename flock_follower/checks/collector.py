@@ -170,6 +170,8 @@ class Collector:
                         for n in config.neighbors if n.source is not None}
         if not seen.has_markers:
             self._kept.clear()
+        states = seen.own.states
+        path = OwnPath(states) if len(states) > 1 else None
         thoroughly = partial(everywhere, markers=[marker for _, marker in markers.values()])
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary)
@@ -177,20 +179,22 @@ class Collector:
                 if not markers.keys() & set(found.ids.tolist()):
                     found = joined(found, search(pixels, config.dictionary))
             fits = camera is not None and pixels.shape == (camera.height, camera.width)
+            up = _upwards(seen, path, picture.stamp) if len(found.ids) else None
             seen.sightings += self._measure(
-                picture, pixels, camera if fits else None, found, config)
+                picture, pixels, camera if fits else None, found, config, up)
             seen.pictures.append(picture)
         self._kept.clear()
 
     def _measure(self, picture: Picture, pixels: GrayImage, camera: CameraModel | None,
-                 found: Detections, config: NeighborConfig) -> list[list[float]]:
+                 found: Detections, config: NeighborConfig, up: Array | None
+                 ) -> list[list[float]]:
         """
         Enter the markers found in a picture; return their rows of ``sightings``.
 
         :param camera: None if unknown: then every outline counts as a marker.
+        :param up: (3,), the upward direction in the camera's axes; None if unknown.
         """
         rows, by_marker = [], config.by_marker()
-        up = upwards(self.observations, picture.stamp) if len(found.ids) else None
         for number, corners in zip(found.ids.tolist(), found.corners):
             side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
             if number not in by_marker:
@@ -229,12 +233,11 @@ def read_own_motion(seen: Observations, messages: list[tuple[int, Any]]) -> OwnM
     return motion
 
 
-def upwards(seen: Observations, stamp: float) -> Array | None:
+def _upwards(seen: Observations, path: OwnPath | None, stamp: float) -> Array | None:
     """Return the upward direction (3,) in the camera's axes at a stamp, s; None if unknown."""
-    states = seen.own.states if seen.own else []
-    if len(states) < 2:
+    if path is None:
         return None
-    quaternions, known = OwnPath(states).attitude(np.array([stamp]))
+    quaternions, known = path.attitude(np.array([stamp]))
     rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
     R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
     up: Array = (quaternion_to_matrix(quaternions[0]) @ R_base_optical)[2]
