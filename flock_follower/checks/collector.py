@@ -75,9 +75,9 @@ class Collector:
         self._small: tuple[float, Array] | None = None
         self._odometry: list[tuple[int, Any]] = []
 
-    def take(self, name: str, topic: str, message: Any, arrival: float) -> GrayImage | None:
+    def take(self, name: str, topic: str, message: Any, arrival: float) -> None:
         """
-        Take a message that arrived at a time, s; return the pixels of an image if decoded.
+        Take a message that arrived at a time, s.
 
         :param name: our name of the topic; '' if its content is not used.
         :param message: None if only its arrival counts.
@@ -88,18 +88,17 @@ class Collector:
         known.arrivals.append(arrival)
         known.stamps.append(stamp)
         if message is None:
-            return None
+            return
         if name == 'odom':
             seen.child_frame = message.child_frame_id
             if seen.own is None:
                 self._odometry.append((to_nanoseconds(arrival), message))
         elif name in (RAW_IMAGES, COMPRESSED_IMAGES):
-            return self._image(message, arrival, stamp)
+            self._image(message, arrival, stamp)
         elif name == 'camera_info':
             seen.calibration = message
         elif name == '/diagnostics':
             self.diagnostics(message)
-        return None
 
     def diagnostics(self, message: Any) -> None:
         """Take a DiagnosticArray; the newest of each name counts."""
@@ -113,10 +112,10 @@ class Collector:
             if files is not None and files not in known:
                 known.append(files)
 
-    def _image(self, message: Any, arrival: float, stamp: float) -> GrayImage | None:
-        """Take an Image or CompressedImage; return its pixels: only some are decoded."""
+    def _image(self, message: Any, arrival: float, stamp: float) -> None:
+        """Take an Image or CompressedImage: only some are decoded."""
         if arrival < min(self._next_pair, self._next_picture):
-            return None
+            return
         picture = Picture(stamp, getattr(message, 'width', 0), getattr(message, 'height', 0),
                           getattr(message, 'encoding', '') or getattr(message, 'format', ''),
                           len(message.data))
@@ -128,7 +127,7 @@ class Collector:
         except ValueError as error:
             picture.fault = str(error)
             self.observations.pictures += [picture] if due else []
-            return None
+            return
         if arrival >= self._next_pair:
             self._pair(stamp, arrival, pixels)
         if due:
@@ -136,7 +135,6 @@ class Collector:
             coarse = pixels[::4, ::4]
             picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
             self._kept.append((picture, pixels))
-        return pixels
 
     def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
         """Measure the shift since the image before, if the time between them suits."""

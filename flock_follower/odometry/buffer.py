@@ -160,7 +160,7 @@ class OdometryBuffer:
             if newest - sample.stamp <= MAX_JUMP:
                 return False
             self.clear()
-        travel = self._travel(sample)
+        row = sample.row(self._travel(sample))
         old = max(0, len(self) + 1 - self.CAPACITY)
         while old < len(self) and sample.stamp - self._rows[old, 0] > self.HORIZON:
             old += 1
@@ -168,10 +168,7 @@ class OdometryBuffer:
         if self._end == len(self._storage):
             self._storage[:held] = self._rows[old:]
             self._end = held
-        row = self._storage[self._end]
-        row[0], row[_POSITION], row[_VELOCITY] = sample.stamp, sample.position, sample.velocity
-        row[_RATE], row[_TRAVEL], row[_ATTITUDE] = (
-            sample.angular_velocity, travel, sample.quaternion)
+        self._storage[self._end] = row
         self._end += 1
         self._rows = self._storage[self._end - held - 1:self._end]
         return jumped
