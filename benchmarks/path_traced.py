@@ -30,7 +30,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from importlib.util import module_from_spec, spec_from_file_location
+from functools import cache
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 import json
 from pathlib import Path
 import sys
@@ -84,6 +85,9 @@ def main(args: Sequence[str] | None = None) -> int:
     if not (DATA / 'bag.py').exists():
         print(f'error: {DATA}: the path-traced flights are not here', file=sys.stderr)
         return 1
+    if find_spec('scipy') is None:
+        print('error: the tool of the path-traced flights needs scipy', file=sys.stderr)
+        return 1
     cv2.setNumThreads(1)
     print('                         default  ours    in means of default  first            '
           'position             3 sigma   RMS\n'
@@ -132,8 +136,9 @@ def fly(name: str, frames: int, seed: int) -> Row:
         float(np.sqrt(np.mean(np.sum(table['position'][known]**2, axis=1)))))
 
 
+@cache
 def load_tool() -> Any:
-    """Return the module that makes bags of the flights."""
+    """Return the module of a file that makes bags of the flights."""
     spec = spec_from_file_location('path_traced_bag', DATA / 'bag.py')
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)

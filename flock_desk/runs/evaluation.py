@@ -36,6 +36,7 @@ from typing import Any, Final
 import numpy as np
 
 from flock_desk.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
+from flock_desk.runs.decoding import decoded_ahead
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.live_line import LiveLine
@@ -65,7 +66,7 @@ from flock_follower.neighbors_file import load, NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.parameters.spec import filled
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import DecodedImage
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
@@ -185,6 +186,8 @@ class Evaluation(Listener):
             for camera in cameras(perception)}, bag.start_ns)
         self.wall_time = 0.0
         self.cpu: defaultdict[str, list[float]] = defaultdict(list)
+        self._decoding: dict[tuple[str, int], float] = {}
+        """CPU time of images decoded ahead, s, by camera and stamp, ns."""
         self.frames = 0
         self.tick_rows: list[tuple[float, ...]] = []
         self.setpoint_rows: list[tuple[float, ...]] = []
@@ -203,7 +206,7 @@ class Evaluation(Listener):
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             cameras={camera.name: (camera.rpy, camera.rectified)
                      for camera in cameras(self._values['planner'])},
-            cpu_time=time.process_time), perceiver
+            cpu_time=time.thread_time), perceiver
 
     @property
     def duration(self) -> float:
@@ -233,13 +236,13 @@ class Evaluation(Listener):
         return True
 
     def take(self, name: str, time: int, msgtype: str, data: bytes, camera: str = '',
-             message: Any = None, pixels: GrayImage | None = None) -> None:
+             message: Any = None) -> None:
         """
         Take a message of our topic ``name``; bytes that are no message of the type are counted.
 
         :param time: when it was recorded, ns.
         :param camera: the name of the camera, if there are several.
-        :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
+        :param message: its fields, if they were read, or the decoded image.
         """
         if name == 'camera_info' and not self._is_new(camera, data):
             return
@@ -273,7 +276,9 @@ class Evaluation(Listener):
         elif name == POSES:
             self.follower.pose(time, camera, pose)
         elif name == RAW_IMAGES:
-            self.follower.image(time, message if pixels is None else pixels, stamp, camera)
+            if isinstance(message, DecodedImage):
+                self._decoding[camera, stamp] = message.spent
+            self.follower.image(time, message, stamp, camera)
 
     def _is_new(self, camera: str, data: bytes) -> bool:
         """Return whether a calibration differs from the last one of its camera; most do not."""
@@ -321,7 +326,8 @@ class Evaluation(Listener):
         if seen is None:
             self.errors.frame(stamp, {}, {}, camera)
         else:
-            self.cpu['decode'].append(outcome.decoding)
+            ahead = self._decoding.pop((camera, outcome.stamp), 0.0)
+            self.cpu['decode'].append(ahead + outcome.decoding)
             self.cpu[seen.stage].append(outcome.perception)
             self.errors.frame(stamp, seen.estimates, seen.stages, camera)
 
@@ -359,7 +365,7 @@ class Evaluation(Listener):
 
     def _moved(self, state: OdometryState) -> OdometryState:
         """Return a state with its stamp as if the bag had no gaps."""
-        return state._replace(stamp=state.stamp - self._skipped_ns)
+        return state._replace(stamp=state.stamp - self._skipped_ns) if self._skipped_ns else state
 
     def truth(self, state: OdometryState, own: bool) -> None:
         """Take the true state of the follower, or of a neighbor."""
@@ -406,18 +412,20 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None, frames: str = '') -> None:
-    message, pixels, began = None, None, False
+    began = False
     line = LiveLine(sys.stderr)
     line.due(time.monotonic())  # a short bag needs no line
     shown = False
-    for topic, msgtype, stamp, data in bag.messages([
-            *used, *(system.topics if system else ()), *([frames] if frames else ())]):
+    # Of several cameras not every image is decoded.
+    images = [topic for topic, use in used.items() if use == (RAW_IMAGES, '')]
+    for (topic, msgtype, stamp, data), message in decoded_ahead(bag.messages([
+            *used, *(system.topics if system else ()), *([frames] if frames else ())]), images):
         if line.due(time.monotonic()):
             done = (stamp - bag.start_ns) / max(bag.end_ns - bag.start_ns, 1)
             line.show(f'{done:4.0%} of {bag.path.name}')
             shown = True
         if system is not None:
-            message, pixels = system.take(topic, msgtype, stamp, data)
+            message = system.take(topic, msgtype, stamp, data, message)
         name, camera = used.get(topic, ('', ''))
         began &= not evaluation.pass_gap(stamp)
         if name in TRUTHS:
@@ -426,7 +434,7 @@ def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
             if not began:
                 began = True
                 evaluation.begin(stamp)
-            evaluation.take(name, stamp, msgtype, data, camera, message, pixels)
+            evaluation.take(name, stamp, msgtype, data, camera, message)
         if topic == frames and began:
             evaluation.follower.source_frame(stamp, stamp_of(data))
     if shown:

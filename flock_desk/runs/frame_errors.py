@@ -117,15 +117,16 @@ class FrameErrors:
         for name, seen in self._seen.items():
             estimate = estimates.get(name)
             seen.extend((0.0, *[np.nan] * (_SIGHTING_LENGTH - 1)) if estimate is None else (
-                STAGES.index(stages.get(name, 'full')), *estimate.position, *estimate.velocity,
-                *estimate.rotation.ravel(), *estimate.covariance[:6, :6].ravel()))
+                STAGES.index(stages.get(name, 'full')), *estimate.position.tolist(),
+                *estimate.velocity.tolist(), *estimate.rotation.ravel().tolist(),
+                *estimate.covariance[:6, :6].ravel().tolist()))
 
     def _take(self, states: array[float], state: OdometryState) -> None:
         """Keep states in the order of their stamps: a late one is dropped."""
         time = state.stamp - self._start
         if not states or time > states[-_STATE_LENGTH]:
-            states.extend((time, *state.position, *state.quaternion, *state.velocity,
-                           *state.angular_velocity))
+            states.extend((time, *state.position.tolist(), *state.quaternion.tolist(),
+                           *state.velocity.tolist(), *state.angular_velocity.tolist()))
 
     def table(self, name: str) -> dict[str, Array]:
         """

@@ -75,9 +75,9 @@ class Collector:
         self._small: tuple[float, Array] | None = None
         self._odometry: list[tuple[int, Any]] = []
 
-    def take(self, name: str, topic: str, message: Any, arrival: float) -> GrayImage | None:
+    def take(self, name: str, topic: str, message: Any, arrival: float) -> None:
         """
-        Take a message that arrived at a time, s; return the pixels of an image if decoded.
+        Take a message that arrived at a time, s.
 
         :param name: our name of the topic; '' if its content is not used.
         :param message: None if only its arrival counts.
@@ -88,18 +88,17 @@ class Collector:
         known.arrivals.append(arrival)
         known.stamps.append(stamp)
         if message is None:
-            return None
+            return
         if name == 'odom':
             seen.child_frame = message.child_frame_id
             if seen.own is None:
                 self._odometry.append((to_nanoseconds(arrival), message))
         elif name in (RAW_IMAGES, COMPRESSED_IMAGES):
-            return self._image(message, arrival, stamp)
+            self._image(message, arrival, stamp)
         elif name == 'camera_info':
             seen.calibration = message
         elif name == '/diagnostics':
             self.diagnostics(message)
-        return None
 
     def diagnostics(self, message: Any) -> None:
         """Take a DiagnosticArray; the newest of each name counts."""
@@ -113,10 +112,10 @@ class Collector:
             if files is not None and files not in known:
                 known.append(files)
 
-    def _image(self, message: Any, arrival: float, stamp: float) -> GrayImage | None:
-        """Take an Image or CompressedImage; return its pixels: only some are decoded."""
+    def _image(self, message: Any, arrival: float, stamp: float) -> None:
+        """Take an Image or CompressedImage: only some are decoded."""
         if arrival < min(self._next_pair, self._next_picture):
-            return None
+            return
         picture = Picture(stamp, getattr(message, 'width', 0), getattr(message, 'height', 0),
                           getattr(message, 'encoding', '') or getattr(message, 'format', ''),
                           len(message.data))
@@ -128,7 +127,7 @@ class Collector:
         except ValueError as error:
             picture.fault = str(error)
             self.observations.pictures += [picture] if due else []
-            return None
+            return
         if arrival >= self._next_pair:
             self._pair(stamp, arrival, pixels)
         if due:
@@ -136,7 +135,6 @@ class Collector:
             coarse = pixels[::4, ::4]
             picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
             self._kept.append((picture, pixels))
-        return pixels
 
     def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
         """Measure the shift since the image before, if the time between them suits."""
@@ -170,6 +168,8 @@ class Collector:
                         for n in config.neighbors if n.source is not None}
         if not seen.has_markers:
             self._kept.clear()
+        states = seen.own.states
+        path = OwnPath(states) if len(states) > 1 else None
         thoroughly = partial(everywhere, markers=[marker for _, marker in markers.values()])
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary)
@@ -177,20 +177,22 @@ class Collector:
                 if not markers.keys() & set(found.ids.tolist()):
                     found = joined(found, search(pixels, config.dictionary))
             fits = camera is not None and pixels.shape == (camera.height, camera.width)
+            up = _upwards(seen, path, picture.stamp) if len(found.ids) else None
             seen.sightings += self._measure(
-                picture, pixels, camera if fits else None, found, config)
+                picture, pixels, camera if fits else None, found, config, up)
             seen.pictures.append(picture)
         self._kept.clear()
 
     def _measure(self, picture: Picture, pixels: GrayImage, camera: CameraModel | None,
-                 found: Detections, config: NeighborConfig) -> list[list[float]]:
+                 found: Detections, config: NeighborConfig, up: Array | None
+                 ) -> list[list[float]]:
         """
         Enter the markers found in a picture; return their rows of ``sightings``.
 
         :param camera: None if unknown: then every outline counts as a marker.
+        :param up: (3,), the upward direction in the camera's axes; None if unknown.
         """
         rows, by_marker = [], config.by_marker()
-        up = upwards(self.observations, picture.stamp) if len(found.ids) else None
         for number, corners in zip(found.ids.tolist(), found.corners):
             side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
             if number not in by_marker:
@@ -229,12 +231,11 @@ def read_own_motion(seen: Observations, messages: list[tuple[int, Any]]) -> OwnM
     return motion
 
 
-def upwards(seen: Observations, stamp: float) -> Array | None:
+def _upwards(seen: Observations, path: OwnPath | None, stamp: float) -> Array | None:
     """Return the upward direction (3,) in the camera's axes at a stamp, s; None if unknown."""
-    states = seen.own.states if seen.own else []
-    if len(states) < 2:
+    if path is None:
         return None
-    quaternions, known = OwnPath(states).attitude(np.array([stamp]))
+    quaternions, known = path.attitude(np.array([stamp]))
     rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
     R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
     up: Array = (quaternion_to_matrix(quaternions[0]) @ R_base_optical)[2]

@@ -27,6 +27,7 @@ calibration: the error of the focal length.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import permutations, product
 import math
 from typing import NamedTuple
@@ -93,9 +94,14 @@ class OwnPath:
         same = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])
         self._stamps = np.array([state.stamp for state in states]) / NANOSECONDS
         self._quaternions = quaternions * same[:, None]
-        self._motion = np.array([
+        self._states = states
+
+    @cached_property
+    def _motion(self) -> Array:
+        """Return positions and velocities in base_link (n, 6); attitudes alone need neither."""
+        return np.array([
             [*state.position, *(state.velocity @ quaternion_to_matrix(state.quaternion))]
-            for state in states])
+            for state in self._states])
 
     def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return attitudes (m, 4) at stamps (m,), s, and which of them are known (m,)."""

@@ -35,7 +35,6 @@ from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
-from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import (
@@ -116,13 +115,15 @@ class RecordedSystem:
         """Return whether what comes at a time, ns, is not checked any more."""
         return time_ns - self._start_ns - self._gaps.skipped_ns >= MAX_DURATION * NANOSECONDS
 
-    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
-             ) -> tuple[Any, GrayImage | None]:
+    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes, message: Any = None
+             ) -> Any:
         """
         Take a message; one of another topic, or one that comes too late, is ignored.
 
-        Return its fields if they were read, and the pixels of an image if decoded. If the bytes
-        are no message of the type, the bag is reported as incomplete.
+        Return its fields if they were read. If the bytes are no message of the type, the bag is
+        reported as incomplete.
+
+        :param message: its fields, if they were read before.
         """
         name = self.topics.get(topic)
         if step := self._gaps.take(time_ns):
@@ -130,15 +131,18 @@ class RecordedSystem:
                 (time_ns - self._start_ns) / NANOSECONDS - step, step,
                 any(self.seen.topic(each).arrivals for each in (self.seen.image_name, 'odom'))))
         if name is None or self.is_long_enough(time_ns):
-            return None, None
+            return message
         try:
-            message = read_odometry(data) if msgtype == ODOMETRY else deserialize(data, msgtype)
+            if message is None:
+                message = read_odometry(data) if msgtype == ODOMETRY else deserialize(
+                    data, msgtype)
         except ValueError as problem:
             self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
-            return None, None
+            return None
         if name == 'odom' and self._read is not None:
             self._read.take(message, time_ns)
-        return message, self._collector.take(name, topic, message, time_ns / NANOSECONDS)
+        self._collector.take(name, topic, message, time_ns / NANOSECONDS)
+        return message
 
     def findings(self) -> list[Finding]:
         """Return the findings in all messages that were taken."""

@@ -128,7 +128,10 @@ class OdometryBuffer:
     STEP = 0.03
 
     def __init__(self) -> None:
-        self._rows: Array = np.empty((0, 17))
+        self._storage: Array = np.empty((2 * self.CAPACITY, 17))
+        self._end = 0
+        self._rows: Array = self._storage[:0]
+        """Those of ``_storage`` that are held, up to ``_end``: adding one copies no other."""
         self._near = self._far = self._rough = 0.0
         self._comparisons = 0
 
@@ -143,7 +146,7 @@ class OdometryBuffer:
 
     def clear(self) -> None:
         """Forget all samples."""
-        self._rows = self._rows[:0]
+        self._rows = self._storage[self._end:self._end]
 
     def add(self, sample: OdometrySample) -> bool:
         """
@@ -157,9 +160,17 @@ class OdometryBuffer:
             if newest - sample.stamp <= MAX_JUMP:
                 return False
             self.clear()
-        old = np.count_nonzero(sample.stamp - self._rows[:, 0] > self.HORIZON)
         row = sample.row(self._travel(sample))
-        self._rows = np.vstack([self._rows[max(old, len(self) + 1 - self.CAPACITY):], row])
+        old = max(0, len(self) + 1 - self.CAPACITY)
+        while old < len(self) and sample.stamp - self._rows[old, 0] > self.HORIZON:
+            old += 1
+        held = len(self) - old
+        if self._end == len(self._storage):
+            self._storage[:held] = self._rows[old:]
+            self._end = held
+        self._storage[self._end] = row
+        self._end += 1
+        self._rows = self._storage[self._end - held - 1:self._end]
         return jumped
 
     def _travel(self, sample: OdometrySample) -> Array:

@@ -311,12 +311,15 @@ class TwistFrame:
         last, self._last = self._last, now
         if last is None:
             return
-        dt = stamp - last[0]
-        way = [new - old for new, old in zip(now[1:4], last[1:4])]
+        then, x, y, z, cx, cy, cz, ox, oy, oz = last
+        _, new_x, new_y, new_z, new_cx, new_cy, new_cz, new_ox, new_oy, new_oz = now
+        dt, dx, dy, dz = stamp - then, new_x - x, new_y - y, new_z - z
         # Trapezoids: a slow source has few messages in a window.
-        off = [0.5 * dt * (old + new) - moved
-               for old, new, moved in zip(last[4:], now[4:], (*way, *way))]
-        self._piece = tuple(map(add, self._piece, (dt, *way, *off)))
+        half = 0.5 * dt
+        self._piece = tuple(map(add, self._piece, (
+            dt, dx, dy, dz,
+            half * (cx + new_cx) - dx, half * (cy + new_cy) - dy, half * (cz + new_cz) - dz,
+            half * (ox + new_ox) - dx, half * (oy + new_oy) - dy, half * (oz + new_oz) - dz)))
         if self._piece[0] < PIECE:
             return
         self._pieces.append(self._piece)

@@ -146,7 +146,7 @@ class OdometrySource:
         self._stamp: int | None = None
         self._epoch = 0
         self._reading = self.twist.frame
-        self._fading: Array = np.zeros(3)
+        self._fading: Array | None = None  # what is left of a step of the velocity
         self._doubt: Array = np.zeros(3)  # by how much the two readings differ, in odom
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
@@ -263,8 +263,9 @@ class OdometrySource:
             velocity = self._as_read(self._reading, time, child, odom)
             if self._gaps and before != self._reading:
                 # The step that another reading would be is faded out.
-                self._fading = (self._fading + self._as_read(before, time, child, odom)) - velocity
-        if self._fading.any():
+                left = np.zeros(3) if self._fading is None else self._fading
+                self._fading = (left + self._as_read(before, time, child, odom)) - velocity
+        if self._fading is not None and self._fading.any():
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading
         return velocity
@@ -296,7 +297,7 @@ class OdometrySource:
         wrong = 0.0 if self._reading == NONE else self.twist.wrong_probability
         for share, off in ((wrong, self._doubt), (1.0, self._fading)):
             # The velocity may be the other reading, and a step being faded out is an error.
-            if share and off.any():
+            if share and off is not None and off.any():
                 in_base = rotation.T.dot(off)
                 twist = twist.copy()
                 twist[:3, :3] += share * (in_base[:, None] * in_base)

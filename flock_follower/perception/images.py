@@ -143,6 +143,21 @@ def compute_in_one_thread() -> None:
     cv2.setNumThreads(1)
 
 
+class DecodedImage:
+    """
+    An image message that was decoded: the fields of the message, and its ``pixels``.
+
+    :param spent: CPU time of decoding it, s.
+    """
+
+    def __init__(self, message: Any, pixels: GrayImage, spent: float) -> None:
+        self._message, self.pixels, self.spent = message, pixels, spent
+
+    def __getattr__(self, field: str) -> Any:
+        """Return a field of the message."""
+        return getattr(self._message, field)
+
+
 def decode_image(message: Any) -> GrayImage:
     """
     Return the pixels of an Image or CompressedImage message, (H, W) uint8, or those given.
@@ -151,6 +166,8 @@ def decode_image(message: Any) -> GrayImage:
     """
     if isinstance(message, np.ndarray):
         return message
+    if isinstance(message, DecodedImage):
+        return message.pixels
     if hasattr(message, 'format'):
         return decode_compressed(message.data)
     return decode(message.encoding, message.height, message.width, message.step,
