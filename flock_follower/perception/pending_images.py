@@ -267,13 +267,19 @@ class Perceiver:
         ), acceleration(make, stamp, name, estimate.child_acceleration,
                         estimate.child_acceleration_covariance)
 
-    def poses(self, make: Make, seen: Processed) -> Iterator[tuple[str, Any]]:
-        """Yield the topic and PoseWithCovarianceStamped of each pose measured in an image."""
+    def poses(self, make: Make, seen: Processed,
+              wanted: Callable[[str], bool] = lambda _: True) -> Iterator[tuple[str, Any]]:
+        """
+        Yield the topic and PoseWithCovarianceStamped of each pose measured in an image.
+
+        :param wanted: returns of a topic whether a message is needed.
+        """
         image = seen.image
         header = getattr(image.message, 'header', None)  # pixels have none
         frame = self._cameras[image.camera].frame if header is None else header.frame_id
         for name, measured in seen.sighting.poses.items():
-            yield pose_topic(name), pose_with_covariance(make, image.stamp_ns, frame, *measured)
+            if wanted(topic := pose_topic(name)):
+                yield topic, pose_with_covariance(make, image.stamp_ns, frame, *measured)
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""
