@@ -60,7 +60,7 @@ from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseSt
 from flock_follower.ranges import parameter, Range
 
 LEADER = 'leader'
-EPOCH = 1_700_000_000 * NANOSECONDS  # of all stamps
+EPOCH_NS = 1_700_000_000 * NANOSECONDS  # stamp of time zero
 CAMERA_FRAME = 'camera_optical_frame'
 POSES_WAIT = 0.35  # s: relative_pose's max_wait by default
 REPORT_STEPS = 5  # of the autopilot, between two reports of velocity, attitude and height
@@ -146,10 +146,10 @@ class DetectorFlight(Listener):
         info.header.frame_id = CAMERA_FRAME
         for name, value in calibration(Camera()).items():
             setattr(info, name, np.array(value) if isinstance(value, list) else value)
-        self._follower.camera_info(EPOCH, info)
+        self._follower.camera_info(EPOCH_NS, info)
 
     @property
-    def _begun(self) -> bool:
+    def _has_begun(self) -> bool:
         return self._flight.began_ns is not None
 
     def fly(self, duration: float) -> Figures:
@@ -160,7 +160,7 @@ class DetectorFlight(Listener):
         """
         while self._flight.time < duration:
             self._step()
-            if not self._begun and self._flight.time_ns > 10 * NANOSECONDS:
+            if not self._has_begun and self._flight.time_ns > 10 * NANOSECONDS:
                 raise RuntimeError(f'not in offboard mode after 10 s: {dict(self._reasons)}')
         squares = np.array(self._distances)**2
         return Figures(
@@ -176,11 +176,11 @@ class DetectorFlight(Listener):
         arrived = flight.after_step(self._state is not State.IDLE)
         self._steps += 1
         now = flight.time_ns * 1e-9
-        time = EPOCH + flight.time_ns
+        time = EPOCH_NS + flight.time_ns
         self._call_services(now, time)
         for sampled, state in arrived:
             follower.odometry(time, from_odometry(odometry(
-                self._make, EPOCH + sampled, 'odom', 'base_link', state.position,
+                self._make, EPOCH_NS + sampled, 'odom', 'base_link', state.position,
                 state.quaternion, state.linear, state.angular, state.pose_covariance,
                 state.twist_covariance)))
         if self._steps % REPORT_STEPS == 0:
@@ -200,7 +200,7 @@ class DetectorFlight(Listener):
                 follower.pose(time, LEADER, pose)
             follower.source_frame(time, stamp)
         follower.advance(time)
-        if self._begun and self._steps % REPORT_STEPS == 0:
+        if self._has_begun and self._steps % REPORT_STEPS == 0:
             self._distances.append(flight.distance)
             self._speeds.append(float(np.linalg.norm(autopilot.vehicle.velocity)))
 
@@ -231,10 +231,10 @@ class DetectorFlight(Listener):
                 error[:3] += detector.outlier * away / np.linalg.norm(away)
             true = (_pose(image.follower) @ T_BODY_OPTICAL).inverse() @ _pose(leader)
             pose = from_pose(pose_with_covariance(
-                self._make, EPOCH + image.stamp_ns, CAMERA_FRAME,
+                self._make, EPOCH_NS + image.stamp_ns, CAMERA_FRAME,
                 Transform(rotation_vector_to_matrix(error[3:]) @ true.rotation,
                           true.translation + error[:3]), np.diag(deviations**2)))
-        self._coming.append((image.stamp_ns * 1e-9 + latency, EPOCH + image.stamp_ns, pose))
+        self._coming.append((image.stamp_ns * 1e-9 + latency, EPOCH_NS + image.stamp_ns, pose))
 
     def _in_sight(self, follower: Odometry, leader: Odometry) -> bool:
         """Return whether the leader is in the image, and shows its back."""
@@ -248,7 +248,7 @@ class DetectorFlight(Listener):
 
     def tick(self, tick: Tick) -> None:
         self._state = tick.decision.state
-        if self._begun:
+        if self._has_begun:
             self._tracks.append(self._state is State.TRACK)
 
     def cycle(self, cycle: ControlCycle) -> None:
@@ -258,7 +258,7 @@ class DetectorFlight(Listener):
         now = self._flight.time_ns * 1e-9
         message = encode_setpoint(setpoint.acceleration, setpoint.yaw, round(now * 1e3))
         self._vehicle.autopilot.controller.on_setpoint(message, now)
-        if self._begun:
+        if self._has_begun:
             self._accelerations.append(math.hypot(message.afx, message.afy, message.afz))
 
     def rejected(self, reason: str, detail: str) -> None:

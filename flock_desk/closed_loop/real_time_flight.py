@@ -53,7 +53,7 @@ FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 LATEST_NS = 30_000_000
 MAX_SKIPPED_SHARE = 0.02  # of the images: more that are left out show in the flight
 CAMERA_SENSOR = Sensor(sub_poses=2)  # poses in an exposure
-_NO_PIXELS = np.zeros((0, 0), np.uint8)
+_NO_PIXELS = np.zeros((0, 0), np.uint8)  # of an image that is not rendered
 
 
 class RenderedImage(NamedTuple):

@@ -18,8 +18,9 @@ from __future__ import annotations
 
 from collections import deque
 
-LATE_FACTOR = 1.5  # times the longest observed wait, and
-LATE_MARGIN = 0.03  # s more: the awaited message is late by now
+#: A message is late after LATE_FACTOR times the longest observed wait, and LATE_MARGIN.
+LATE_FACTOR = 1.5
+LATE_MARGIN = 0.03  # s
 N_OBSERVED = 50  # newest waits that count
 
 
