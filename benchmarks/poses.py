@@ -53,29 +53,39 @@ def summary(errors: list[list[float]]) -> dict[str, float]:
                               *rows[:, 2:].mean(axis=0).tolist())))
 
 
-def judge(poses: Path, truth: Path, T_body_camera: Transform, name: str) -> dict[str, float]:
+def truth_of(bag: Path, name: str) -> tuple[list[list[OdometrySample]], int]:
     """
-    Return the figures of the poses of a neighbor.
+    Return the true motion of the follower and of a neighbor, and the start, ns, of their stamps.
 
     :raises BagError: for a bag that cannot be read.
     """
     true: dict[str, list[OdometrySample]] = {'': [], name: []}
-    with open_bag(truth) as bag:
-        start = bag.start_ns
-        for topic, msgtype, _, data in bag.messages(['/truth/odom', '/truth/neighbors']):
+    with open_bag(bag) as opened:
+        start = opened.start_ns
+        for topic, msgtype, _, data in opened.messages(['/truth/odom', '/truth/neighbors']):
             state = from_odometry(deserialize(data, msgtype))
             own = '' if topic == '/truth/odom' else state.child
             if own in true:
                 true[own].append(OdometrySample(
                     (state.stamp - start) / NANOSECONDS, state.position, state.quaternion,
                     state.velocity, state.angular_velocity))
+    return [*true.values()], start
+
+
+def judge(poses: Path, truth: Path, T_body_camera: Transform, name: str) -> dict[str, float]:
+    """
+    Return the figures of the poses of a neighbor.
+
+    :raises BagError: for a bag that cannot be read.
+    """
+    true, start = truth_of(truth, name)
     errors = []
     with open_bag(poses) as bag:
         for _, msgtype, _, data in bag.messages([f'/{pose_topic(name)}']):
             measured = from_pose(deserialize(data, msgtype))
             assert measured.covariance is not None
             stamp = (measured.stamp - start) / NANOSECONDS
-            own, other = (_at(samples, stamp) for samples in true.values())
+            own, other = (pose_at(samples, stamp) for samples in true)
             if own is not None and other is not None:
                 errors.append(errors_of(
                     Transform.from_quaternion(measured.position, measured.quaternion),
@@ -83,7 +93,7 @@ def judge(poses: Path, truth: Path, T_body_camera: Transform, name: str) -> dict
     return summary(errors)
 
 
-def _at(samples: list[OdometrySample], stamp: float) -> Transform | None:
+def pose_at(samples: list[OdometrySample], stamp: float) -> Transform | None:
     """Return the pose at a stamp, s; None if no sample is on either side."""
     after = next((k for k, sample in enumerate(samples) if sample.stamp >= stamp), 0)
     if not after:

@@ -67,8 +67,9 @@ ROOMS = {
              'aiohttp cv2 numpy'),
     'support': ('bridge_state gate mavlink messages odometry parameters perception '
                 'pose_messages', 'ROS numpy'),
-    'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
-              'parameters perception planner pose_messages support topic_names view',
+    'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages '
+              'neighbors_file odometry parameters perception planner pose_messages support '
+              'topic_names view',
               'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink'),
@@ -77,8 +78,9 @@ ROOMS = {
     'camera': ('perception', 'cv2 numpy'),
     'follower': ('command_messages flock gate messages perception planner pose_messages', ''),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
-                    'perception planner scenarios sensors vehicles', 'numpy'),
+    'closed_loop': ('camera external flock flocking follower gate mavlink messages '
+                    'neighbors_file odometry perception planner pose_messages scenarios sensors '
+                    'vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop command_messages flocking flocks follower gate '
              'mavlink messages neighbors_file odometry parameters perception planner '

@@ -53,6 +53,7 @@ FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 LATEST_NS = 30_000_000
 MAX_SKIPPED_SHARE = 0.02  # of the images: more that are left out show in the flight
 CAMERA_SENSOR = Sensor(sub_poses=2)  # poses in an exposure
+_NO_PIXELS = np.zeros((0, 0), np.uint8)  # of an image that is not rendered
 
 
 class RenderedImage(NamedTuple):
@@ -75,12 +76,14 @@ class RealTimeFlight:
     """
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
+    :param camera: None: images have no pixels, for a detector that is simulated.
     :param latest_ns: images that are later than this are skipped.
     :param leader: a leader flown elsewhere; None: the scenario's own leader.
     """
 
-    def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
-                 latest_ns: int = LATEST_NS, leader: FlownLeader | None = None) -> None:
+    def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle,
+                 camera: Renderer | None, latest_ns: int = LATEST_NS,
+                 leader: FlownLeader | None = None) -> None:
         self.scenario = ScenarioRun(scenario, run, isinstance(vehicle, EmbeddedVehicle))
         self.time_ns = 0
         self.began_ns: int | None = None
@@ -155,17 +158,21 @@ class RealTimeFlight:
             self.skipped_images += 1
 
     def _frame(self, stamp_ns: int) -> RenderedImage:
-        moments = [round(1e9 * t) for t in CAMERA_SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
         hidden = self.scenario.hides(time)
         leader = self._leader.motion(stamp_ns, time)
         usable = not (hidden or leader is None or self.scenario.scenario.fails('vio', time))
-        motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
-        leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
-        pixels = self.camera.image(
-            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders)
+        pixels = _NO_PIXELS if self.camera is None else self._render(self.camera, stamp_ns, hidden)
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
                              self.vehicle.at(stamp_ns), leader, usable)
+
+    def _render(self, camera: Renderer, stamp_ns: int, hidden: bool) -> NDArray[np.uint8]:
+        """Return the pixels of an image, with the leader if it is not hidden."""
+        moments = [round(1e9 * t) for t in CAMERA_SENSOR.times(stamp_ns * 1e-9)]
+        motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
+        leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
+        return camera.image(
+            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE_START if self.began_ns is None else (time_ns - self.began_ns) * 1e-9

@@ -31,6 +31,7 @@ from flock_follower.checks.observations import (
     TopicSeen,
 )
 from flock_follower.checks.pictures import camera_model
+from flock_follower.checks.pose_topics import Arrival, judge_poses
 from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
@@ -49,7 +50,9 @@ from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 from flock_follower.perception.prints import turned_print, with_wide_borders, wrong_border
 from flock_follower.perception.search import everywhere
-from flock_follower.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
+from flock_follower.perception.tracker import camera_mounting
+from flock_follower.pose_messages import from_pose
+from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 
 #: Number of images that are searched for markers, and least time between them, s.
 PICTURES: Final = 25
@@ -57,6 +60,8 @@ PICTURE_PERIOD: Final = 0.1
 #: Time between two images whose shift is measured, s, and the number of pairs.
 PAIR: Final = (0.03, 0.16)
 PAIRS: Final = 90
+#: The name of all topics with the poses of another detector.
+POSES: Final = 'poses'
 
 
 class Collector:
@@ -74,6 +79,8 @@ class Collector:
         self._next_picture = self._next_pair = -math.inf
         self._small: tuple[float, Array] | None = None
         self._odometry: list[tuple[int, Any]] = []
+        self._poses: dict[str, list[Arrival]] = {}
+        """Poses by another detector, by the full name of the topic."""
 
     def take(self, name: str, topic: str, message: Any, arrival: float) -> None:
         """
@@ -99,6 +106,15 @@ class Collector:
             seen.calibration = message
         elif name == '/diagnostics':
             self.diagnostics(message)
+        elif name == POSES:
+            self._take_pose(topic, message, arrival)
+
+    def _take_pose(self, topic: str, message: Any, arrival: float) -> None:
+        try:
+            pose = from_pose(message)
+        except ValueError:  # an invalid stamp: the latency shows it
+            return
+        self._poses.setdefault(topic, []).append(Arrival(arrival, pose))
 
     def diagnostics(self, message: Any) -> None:
         """Take a DiagnosticArray; the newest of each name counts."""
@@ -164,8 +180,7 @@ class Collector:
             camera = camera_model(seen)
         except ValueError:
             camera = None  # reported with the calibration
-        seen.sources = {n.name: n.source.topic
-                        for n in config.neighbors if n.source is not None}
+        self._judge_poses(config)
         if not seen.has_markers:
             self._kept.clear()
         states = seen.own.states
@@ -182,6 +197,19 @@ class Collector:
                 picture, pixels, camera if fits else None, found, config, up)
             seen.pictures.append(picture)
         self._kept.clear()
+
+    def _judge_poses(self, config: NeighborConfig) -> None:
+        """Take the poses by another detector as relative_pose does."""
+        seen, frame = self.observations, getattr(self.observations.calibration, 'header', None)
+        seen.frames_topic = config.frames_topic
+        mounting = camera_mounting(*(seen.value('relative_pose', name, [0.0, 0.0, 0.0])
+                                     for name in ('camera_position', 'camera_rpy')))
+        seen.sources = judge_poses(
+            config, {n.name: self._poses.get(full_name(n.source.topic, seen.namespace), [])
+                     for n in config.neighbors if n.source is not None and n.source.topic},
+            seen.own.states if seen.own else [],
+            {frame.frame_id: mounting} if frame is not None and frame.frame_id else {},
+            seen.static) if any(n.source is not None for n in config.neighbors) else {}
 
     def _measure(self, picture: Picture, pixels: GrayImage, camera: CameraModel | None,
                  found: Detections, config: NeighborConfig, up: Array | None

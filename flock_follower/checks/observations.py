@@ -31,6 +31,7 @@ from flock_follower.checks.reach import Reach
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
+from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.prints import Fault
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
@@ -139,6 +140,26 @@ class OwnMotion:
 
 
 @dataclass
+class SourceSeen:
+    """
+    The poses of a neighbor by another detector, as relative_pose takes them.
+
+    ``topic`` is '' for a frame on /tf; ``frame`` is that of the newest pose. Numbers of poses:
+    ``taken`` in all, ``refused`` by reason, ``used`` by the filter, ``outliers`` outside its gate,
+    ``outside`` of the sight of their camera, ``tilted`` far from upright.
+    """
+
+    topic: str
+    frame: str = ''
+    taken: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    used: int = 0
+    outliers: int = 0
+    outside: int = 0
+    tilted: int = 0
+
+
+@dataclass
 class Observations:
     """
     All observations.
@@ -167,8 +188,12 @@ class Observations:
     dictionary: str = ''
     marker_sides: dict[int, float] = field(default_factory=dict)
     """The configured length of the sides of each neighbor's marker, m, by its id."""
-    sources: dict[str, str] = field(default_factory=dict)
-    """Topic of the poses by another detector, '' for a frame on /tf, by neighbor."""
+    sources: dict[str, SourceSeen] = field(default_factory=dict)
+    """The poses by another detector, by neighbor."""
+    frames_topic: str = ''
+    """Of the images that the other detector processes; '' if the neighbors' file names none."""
+    static: StaticFrames = field(default_factory=StaticFrames)
+    """The frames of tf_static."""
     pictures: list[Picture] = field(default_factory=list)
     shifts: list[list[float]] = field(default_factory=list)
     sightings: list[list[float]] = field(default_factory=list)

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
 from flock_follower.bags.schedule import Gaps
-from flock_follower.checks.collector import Collector
+from flock_follower.checks.collector import Collector, POSES
 from flock_follower.checks.findings import Finding, without_consequences
 from flock_follower.checks.flight_settings import check_settings
 from flock_follower.checks.observations import Observations, OwnMotion, TopicEnd, TopicSeen
@@ -36,9 +36,11 @@ from flock_follower.messages import NANOSECONDS, ODOMETRY
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.markers import load
+from flock_follower.pose_messages import POSE_TYPES
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import (
     COMPRESSED_IMAGES,
+    full_name,
     images_by_type,
     names_there,
     RAW_IMAGES,
@@ -110,6 +112,11 @@ class RecordedSystem:
                        and bag.topics[names[name]].msgtype == msgtype
                        and (name not in _IMAGES or name == self.seen.image_name)}
         """Our names of the topics to take, by their full names."""
+        self.topics |= {full: POSES for n in self._neighbors.neighbors
+                        if n.source is not None and n.source.topic
+                        for full in [full_name(n.source.topic, namespace)]
+                        if full in self.seen.topics
+                        and bag.topics[full].msgtype in POSE_TYPES and full not in self.topics}
 
     def is_long_enough(self, time_ns: int) -> bool:
         """Return whether what comes at a time, ns, is not checked any more."""

@@ -19,8 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-import numpy as np
-
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -29,9 +27,10 @@ from flock_follower.checks.findings import (
     UNMEASURED,
     WARNING,
 )
-from flock_follower.checks.observations import Observations, TopicSeen
+from flock_follower.checks.observations import Observations
+from flock_follower.checks.pose_topics import check_poses
 from flock_follower.checks.reach import Reach
-from flock_follower.pose_messages import POSE_TYPES
+from flock_follower.checks.streams import check_stream
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS, RAW_IMAGES, TYPES
 
@@ -39,16 +38,6 @@ from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS
 ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',
                         'command/trajectory', 'mavlink_bridge/state', 'neighbors')
 START: Final = 'ros2 launch flock_follower follower.launch.py'
-#: s: stamps that differ by more from the arrival are of another clock.
-OTHER_CLOCK: Final = 10.0
-#: s: median of stamps in the future from which on there is a warning, and an error: the clocks
-#: differ. The nodes accept single stamps up to ``messages.FUTURE_TOLERANCE`` ahead.
-CLOCK_AHEAD: Final = (0.003, 0.03)
-#: Share of messages with the stamp of the one before, from which on there is an error.
-REPEATED: Final = 0.1
-#: A topic has stopped if its last message came so long, s, and so many of its longest gaps,
-#: before the newest message of any topic.
-STOPPED: Final = (1.0, 3.0)
 
 
 def check_topics(seen: Observations) -> Iterator[Finding]:
@@ -68,38 +57,20 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
         yield _gaps(seen)
     for name in (seen.image_name, 'camera_info', 'odom') if seen.has_markers else ('odom',):
         yield _check_published(seen, name)
-    for name, topic in seen.sources.items():
-        if topic:
-            yield _check_source(seen, name, topic)
+    yield from check_poses(seen)
     late = float(seen.value('planner', 'odom_timeout', 0.3))
     if seen.has_markers:
-        yield from _stream(
+        yield from check_stream(
             seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
             faster='raise the frame rate of the camera; reduce the exposure time in the dark',
             sooner='send smaller images, or gray ones; have the camera on this computer')
-    yield from _stream(
+    yield from check_stream(
         seen, 'odom', seen.topic('odom'), rates=(18.0, 8.0), latencies=(0.5 * late, 0.8 * late),
         faster='raise the output rate of the odometry (IMU rate, if its driver offers that)',
         sooner='give its source more processor time, or smaller images; have it publish per IMU '
         'message if it can')
     if seen.live:
         yield from _publishers(seen)
-
-
-def _check_source(seen: Observations, name: str, topic: str) -> Finding:
-    """Check the topic of the poses of a neighbor that another detector measures."""
-    full = full_name(topic, seen.namespace)
-    found = seen.topics.get(full, TopicSeen())
-    number = len(found.publishers)
-    usable = {*POSE_TYPES} & {*found.types}
-    return first(
-        f'poses of {name}', 'one publisher of poses',
-        (not number and not seen.live, ERROR, f'the bag lacks {full}', 'record it'),
-        (not number, ERROR, f'no node publishes {full}', 'start the other detector'),
-        (number > 1, ERROR, f'{number} publishers of {full}: none is used', 'end all but one'),
-        (not usable, ERROR, f'{full} holds {", ".join(found.types)}',
-         f'have it send {POSE_TYPES[0]}'),
-        (True, OK, f'{full}; without a marker the guard keeps no viewing angle', ''))
 
 
 def check_nodes(seen: Observations) -> Finding:
@@ -180,69 +151,6 @@ def _check_published(seen: Observations, name: str) -> Finding:
         (not topic.arrivals, ERROR, f'{nodes} publishes {full}, and sends nothing',
          "see the node's log; is the sensor connected, calibrated and initialized?"),
         (True, OK, f'{full}, {len(topic.arrivals)} messages', ''))
-
-
-def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[float, float],
-            latencies: tuple[float, float], faster: str, sooner: str) -> Iterator[Finding]:
-    """
-    Check rate, stamps and latency of a topic, and whether it has stopped.
-
-    On a busy computer rate and latency are not judged if they are faulty.
-
-    :param rates: below which there is a warning, and an error, Hz; ``faster``: the advice.
-    :param latencies: above which there is a warning, and an error, s; ``sooner``: the advice.
-    """
-    if not topic.arrivals:
-        return
-    gap = float(np.max(np.diff(topic.arrivals), initial=0.0))
-    newest = max(other.arrivals[-1] for other in seen.topics.values() if other.arrivals)
-    silence = newest - topic.arrivals[-1]
-    if seen.live and silence > max(STOPPED[0], STOPPED[1] * gap):
-        yield Finding(ERROR, name, f'stopped: none in the last {silence:.1f} s',
-                      'messages to the end', 'see the log of its driver; is it still running?')
-    frequency = seen.rate(topic)
-    wanted, rate = f'{rates[0]:g} Hz or more', f'{frequency:.1f} Hz'
-    busy = 'not judged, the computer is too busy: '
-    yield first(
-        f'{name} rate', wanted,
-        (len(topic.arrivals) <= 2, UNMEASURED, f'{len(topic.arrivals)} messages are too few', ''),
-        (seen.busy and frequency < rates[0], UNMEASURED, busy + rate, ''),
-        (frequency < rates[1], ERROR, rate, faster),
-        (frequency < rates[0], WARNING, rate, faster),
-        (True, OK, rate, ''))
-    late = np.array(topic.arrivals) - np.array(topic.stamps)
-    middle, most = float(np.median(late)), float(np.percentile(late, 95))
-    stamped = np.array(topic.stamps) > 0.0
-    steps = np.diff(late[stamped])
-    jumps = np.flatnonzero(np.abs(steps) > OTHER_CLOCK)
-    jump, since = ((-steps[jumps[0]], np.array(topic.arrivals)[stamped][jumps[0]]
-                    - topic.arrivals[0]) if jumps.size else (0.0, 0.0))
-    ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
-    synchronize = 'synchronize the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
-    measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
-    repeated = int(np.count_nonzero(np.diff(np.array(topic.stamps)[stamped]) == 0.0))
-    yield first(
-        f'{name} latency', f'below {latencies[0]:g} s after its stamp',
-        (jumps.size, ERROR,
-         f'stamps jump by {jump:+.1f} s against the time they came, after {since:.1f} s',
-         'a clock was set meanwhile: synchronize all clocks before the flight (chrony, PTP), and '
-         'have the driver stamp by the clock of ROS'),
-        (repeated > REPEATED * len(topic.stamps), ERROR,
-         f'{repeated} of {len(topic.stamps)} have the stamp of the message before',
-         'have the driver stamp each message when it is measured; of a camera that publishes each '
-         'image twice, or of two cameras in one topic, take one'),
-        (abs(middle) > OTHER_CLOCK, ERROR,
-         f'stamped {abs(middle):.0f} s {"before" if middle > 0.0 else "after"} it came: no stamp, '
-         'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '
-         'computers; have the driver stamp by the clock of ROS (a replayed bag: ros2 bag record '
-         '--use-sim-time)'),
-        (middle < -CLOCK_AHEAD[1], ERROR, ahead, synchronize),
-        (middle < -CLOCK_AHEAD[0], WARNING, ahead, synchronize),
-        (seen.busy and (middle > latencies[0] or most > latencies[1]), UNMEASURED,
-         busy + measured, ''),
-        (middle > latencies[1], ERROR, measured, sooner),
-        (middle > latencies[0] or most > latencies[1], WARNING, measured, sooner),
-        (True, OK, measured, ''))
 
 
 def _publishers(seen: Observations) -> Iterator[Finding]:

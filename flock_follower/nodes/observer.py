@@ -20,7 +20,7 @@ The observer publishes nothing and sets nothing; it requests the parameters of o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 import os
@@ -35,7 +35,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from flock_follower.checks.collector import Collector
+from flock_follower.checks.collector import Collector, POSES
 from flock_follower.checks.observations import Machine, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load, LOAD_PERIOD, LoadMeter
 from flock_follower.checks.reach import find_reach, Reach
@@ -43,6 +43,7 @@ from flock_follower.checks.single_camera import alone
 from flock_follower.fast_dds import dead_segments
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
@@ -53,6 +54,7 @@ from flock_follower.nodes.support.runtime import READERS
 from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
+from flock_follower.pose_messages import POSE_TYPES
 from flock_follower.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
@@ -90,6 +92,7 @@ class Observer(Node):
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
         self._static = StaticChild(self)
+        self.seen.static = self._static.frames
         self._simulated: float | None = None
         self._begin = time.monotonic() + DISCOVERY  # before, /clock may not be found
         self._subscribed: set[str] = set()
@@ -119,9 +122,12 @@ class Observer(Node):
         self.seen.machine = _machine(meter.worst())
         self._look_at_graph()
         self.seen.static_child = self._static.transform(self.seen.child_frame)
-        own = self.seen.value('relative_pose', 'neighbors_file', '')
-        self._collector.finish(load(own or resource('config/neighbors.yaml')))
+        self._collector.finish(self._neighbors())
         return self.seen
+
+    def _neighbors(self) -> NeighborConfig:
+        own = self.seen.value('relative_pose', 'neighbors_file', '')
+        return load(own or resource('config/neighbors.yaml'))
 
     def _look(self) -> None:
         """Ask nodes that are new for their parameters, and subscribe to topics that are new."""
@@ -144,9 +150,22 @@ class Observer(Node):
                 kind = message_class(TYPES[name])
                 self.create_subscription(kind, topic, partial(self._take, name, topic),
                                          best_effort(50), raw=kind in READERS or name in COUNTED)
+        self._look_for_poses(published)
         if '/clock' not in self._subscribed and self.count_publishers('/clock'):
             self._subscribed.add('/clock')
             self.create_subscription(Clock, '/clock', self._take_clock, best_effort(50))
+
+    def _look_for_poses(self, published: Mapping[str, list[str]]) -> None:
+        """Subscribe to the poses of other detectors, once the parameters have come."""
+        if 'relative_pose' not in self.seen.parameters:
+            return
+        for source in (n.source for n in self._neighbors().neighbors if n.source is not None):
+            topic = full_name(source.topic, self.seen.namespace) if source.topic else ''
+            msgtype = next((each for each in POSE_TYPES if each in published.get(topic, ())), '')
+            if msgtype and topic not in self._subscribed:
+                self._subscribed.add(topic)
+                self.create_subscription(message_class(msgtype), topic, partial(
+                    self._take, POSES, topic), best_effort(50))
 
     def _names_of(self, relative_pose: str) -> None:
         """Take the names of our topics from the subscriptions of relative_pose."""
@@ -180,7 +199,7 @@ class Observer(Node):
         # The time of reception, not that of the callback: decoding an image takes a while.
         arrival = (self._simulated if self._simulated is not None
                    else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
-        if name in COUNTED or self.seen.names[name] != topic:  # of another camera
+        if name in COUNTED or self.seen.names.get(name, topic) != topic:  # of another camera
             message = None
         elif isinstance(message, bytes):
             message = read_odometry(message)

@@ -22,7 +22,6 @@ recent images had to, and never longer than ``max_wait``.
 from __future__ import annotations
 
 from bisect import insort
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -41,15 +40,13 @@ from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.perception.observed_wait import ObservedWait
 from flock_follower.perception.pose_sources import PoseSources
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
 from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseState
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
-WAITS = 50  # images over which the wait for odometry is observed
-LONGER = 1.5  # times the longest of these waits, and
-MARGIN = 0.03  # s more: odometry is late by now
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -117,8 +114,7 @@ class Perceiver:
         self.tracker = tracker
         self.frame = ''
         self._choice = OdometryChoice()
-        self._max_wait = max_wait
-        self._waits: deque[float] = deque(maxlen=WAITS)  # of images that odometry reached, s
+        self._wait = ObservedWait(max_wait)  # of images for odometry
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self.sources = PoseSources(tracker, max_wait)
         self._epoch: int | None = None
@@ -127,14 +123,7 @@ class Perceiver:
     @property
     def overdue(self) -> float | None:
         """Return when a waiting image will not wait any longer, s, or None."""
-        return min((image.received + self._wait for image in self._pending), default=None)
-
-    @property
-    def _wait(self) -> float:
-        """Return how long an image waits for odometry now, s."""
-        if len(self._waits) < WAITS:
-            return self._max_wait
-        return min(LONGER * max(self._waits) + MARGIN, self._max_wait)
+        return min((image.received + self._wait.limit for image in self._pending), default=None)
 
     def model(self, camera: str = '') -> CameraModel | None:
         """Return the calibration of a camera; None before a usable one."""
@@ -246,11 +235,11 @@ class Perceiver:
         reached = self._cameras[image.camera].model is not None and self.tracker.missing(
             image.stamp, camera=image.camera) not in (Missing.TOO_NEW, Missing.EMPTY)
         if reached:
-            self._waits.append(waited)
-        elif waited < self._wait:
+            self._wait.observe(waited)
+        elif waited < self._wait.limit:
             return False
         else:
-            self._waits.clear()  # odometry may be later from now on: wait longer
+            self._wait.forget()
         return True
 
     def take_range(self, measured: RangeState) -> Rejection | None:
@@ -278,13 +267,19 @@ class Perceiver:
         ), acceleration(make, stamp, name, estimate.child_acceleration,
                         estimate.child_acceleration_covariance)
 
-    def poses(self, make: Make, seen: Processed) -> Iterator[tuple[str, Any]]:
-        """Yield the topic and PoseWithCovarianceStamped of each pose measured in an image."""
+    def poses(self, make: Make, seen: Processed,
+              wanted: Callable[[str], bool] = lambda _: True) -> Iterator[tuple[str, Any]]:
+        """
+        Yield the topic and PoseWithCovarianceStamped of each pose measured in an image.
+
+        :param wanted: returns of a topic whether a message is needed.
+        """
         image = seen.image
         header = getattr(image.message, 'header', None)  # pixels have none
         frame = self._cameras[image.camera].frame if header is None else header.frame_id
         for name, measured in seen.sighting.poses.items():
-            yield pose_topic(name), pose_with_covariance(make, image.stamp_ns, frame, *measured)
+            if wanted(topic := pose_topic(name)):
+                yield topic, pose_with_covariance(make, image.stamp_ns, frame, *measured)
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""

@@ -37,6 +37,7 @@ from flock_follower.neighbors_file import PoseSource
 from flock_follower.odometry.buffer import Missing
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.look import Sighting
+from flock_follower.perception.observed_wait import ObservedWait
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Tracker
 from flock_follower.pose_messages import PoseState
@@ -49,11 +50,11 @@ OLDEST_POSE = 1.0
 #: s: a pose and a frame whose stamps differ by less are of one image.
 SAME_IMAGE = 1e-3
 MOST_WAITING = 100  # poses, and frames: a bound on memory
-LATENCIES = 50  # number of poses over which their latency is observed
-LATE_MARGIN = 0.03  # s beyond the longest latency, after which a frame has no pose
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
 AXES_VARIANCE = 1e-4
 BASE = 'base_link'
+LATE_POSE = 0.1  # s after its stamp: a larger median is reported
+MANY_OUTLIERS = 0.02  # share of poses outside the gate that is reported
 
 UNKNOWN_FRAME = 'pose in an unknown frame'
 UNTIMELY = 'pose stamp repeated, too old or ahead of the odometry'
@@ -111,7 +112,7 @@ class PoseSources:
         self.static = StaticFrames()
         self._tracker, self._max_wait = tracker, max_wait
         self._with_frames = bool(config.frames_topic)
-        self._latencies: deque[float] = deque(maxlen=LATENCIES)
+        self._wait = ObservedWait(max_wait, needed=1)  # of frames for their poses
         self.restart()
 
     def restart(self) -> None:
@@ -119,6 +120,7 @@ class PoseSources:
         self._newest = dict.fromkeys(self.sources, -math.inf)
         self._poses: list[_Waiting] = []
         self._frames: deque[_Frame] = deque(maxlen=MOST_WAITING)
+        self._recent: deque[_Frame] = deque(maxlen=MOST_WAITING)  # waiting, or passed on
         self._shown = self._reached = -math.inf  # stamps of the newest frame, and pose, used, s
 
     @property
@@ -166,6 +168,9 @@ class PoseSources:
         if self._frames and stamp < self._frames[-1].stamp:
             self._frames.clear()
         self._frames.append(_Frame(stamp, stamp_ns, now))
+        self._recent.append(self._frames[-1])
+        if any(abs(stamp - newest) < SAME_IMAGE for newest in self._newest.values()):
+            self._wait.observe(0.0)  # the pose came before its frame
 
     def due(self, now: float) -> Iterator[Sourced | Rejection | int]:
         """Use every pose that odometry has reached; yield the results, and stamps of frames."""
@@ -200,20 +205,18 @@ class PoseSources:
 
     def _observe_latency(self, each: _Waiting) -> None:
         """Learn how long after its frame a pose comes; pass that frame and those before on."""
-        for frame in self._frames:
+        for frame in self._recent:
             if abs(frame.stamp - each.stamp) < SAME_IMAGE:
-                self._latencies.append(max(each.received - frame.received, 0.0))
+                self._wait.observe(max(each.received - frame.received, 0.0))
         self._reached = each.stamp
 
     def _due_frames(self, now: float) -> Iterator[int]:
-        wait = self._max_wait if not self._latencies else min(
-            max(self._latencies) + LATE_MARGIN, self._max_wait)
         pending = [each.stamp for each in self._poses]
         while self._frames:
             frame = self._frames[0]
             used = frame.stamp <= self._reached + SAME_IMAGE and not (
                 pending and pending[0] <= frame.stamp + SAME_IMAGE)
-            if not used and now - frame.received < wait:
+            if not used and now - frame.received < self._wait.limit:
                 return
             self._frames.popleft()
             yield from self._show(frame.stamp, frame.stamp_ns)

@@ -115,7 +115,7 @@ class Rig(Driven):
         self.give('ranges', message)
 
     def watch(self, topic: str) -> list[Any]:
-        """Subscribe to a debug image; return what is sent."""
+        """Subscribe to a debug image, or to poses; return what is sent."""
         publisher = next(p for p in self.node.publishers if p.topic_name.endswith(topic))
         publisher.get_subscription_count = lambda: 1
         return self.sent[publisher.topic_name.lstrip('/')]
@@ -166,13 +166,16 @@ def test_measured_pose_is_in_the_frame_of_the_image(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     for k in range(5):
+        if k == 1:  # nobody subscribed to the first one
+            assert not r.sent['neighbors/leader/pose']
+            r.watch('neighbors/leader/pose')
         r.odom(k / 40)
         r.image(k / 40, image if k < 3 else EMPTY, header=Header(
             frame_id='optical', stamp=nanoseconds_to_stamp(START + round(k / 40 * 1e9))))
     assert len(r.frames) == 5
     poses = [from_pose(message) for message in r.sent['neighbors/leader/pose']]
     # None is repeated while the neighbor is out of sight.
-    assert [pose.stamp - START for pose in poses] == [0, 25_000_000, 50_000_000]
+    assert [pose.stamp - START for pose in poses] == [25_000_000, 50_000_000]
     true = camera_mounting([0.1, 0.0, 0.0], RPY['front']).inverse() @ AHEAD
     assert poses[-1].frame == 'optical' and poses[-1].covariance is not None
     np.testing.assert_allclose(poses[-1].position, true.translation, atol=0.02)

@@ -179,9 +179,31 @@ def test_frames_follow_the_poses_of_their_images() -> None:
         assert due(k / 10) == []
     perceiver.take_pose('leader', pose(0.0), 0.15)
     assert due(0.15) == stamps[:1]
-    assert due(0.27) == [] and due(0.29) == stamps[1:2]  # 0.1 s, and 0.15 s + LATE_MARGIN
+    assert due(0.35) == [] and due(0.36) == stamps[1:2]  # 0.1 s + 1.5 * 0.15 s + LATE_MARGIN
     perceiver.take_frame(stamps[2], 0.5)
-    assert due(0.67) == [] and due(0.69) == stamps[2:3]
+    assert due(0.75) == [] and due(0.76) == stamps[2:3]
+
+
+def test_a_frame_after_its_pose_teaches_that_no_later_frame_has_to_wait() -> None:
+    neighbors = parse({'frames_topic': '/info', 'neighbors': [
+        {'name': 'leader', 'pose_topic': '/poses'}]})
+    perceiver = started(neighbors)
+    seconds(perceiver, 0.0, 1.0)
+    for t in (0.0, 0.1):
+        perceiver.take_pose('leader', pose(t), t + 0.2)
+        assert [each for each in perceiver.sources.due(t + 0.2) if isinstance(each, int)] == []
+        perceiver.take_frame(to_nanoseconds(START + t), t + 0.2)
+        assert [*perceiver.sources.due(t + 0.2)] == [to_nanoseconds(START + t)]
+    perceiver.take_frame(to_nanoseconds(START + 0.2), 0.4)  # its pose is missing
+    assert [*perceiver.sources.due(0.42)] == []
+    assert [*perceiver.sources.due(0.44)] == [to_nanoseconds(START + 0.2)]
+    # The detector is slower from now on: one frame is passed on too early, the next one waits.
+    for t, too_early in ((0.3, True), (0.4, False)):
+        perceiver.take_frame(to_nanoseconds(START + t), t)
+        assert bool([*perceiver.sources.due(t + 0.04)]) == too_early
+        perceiver.take_pose('leader', pose(t), t + 0.1)
+        assert [each for each in perceiver.sources.due(t + 0.1) if isinstance(each, int)] == (
+            [] if too_early else [to_nanoseconds(START + t)])
 
 
 @pytest.mark.parametrize(('entry', 'message'), [

@@ -32,13 +32,16 @@ from flock_follower.nodes.support.inputs import best_effort, StaticChild, TRANSF
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.pending_images import Perceiver
-from flock_follower.perception.pose_sources import Sourced, TWO_PUBLISHERS
+from flock_follower.perception.pose_sources import (
+    LATE_POSE,
+    MANY_OUTLIERS,
+    Sourced,
+    TWO_PUBLISHERS,
+)
 from flock_follower.pose_messages import from_pose, POSE_TYPES, stamp_of, TRANSFORMS
 
 LOOK_PERIOD = 0.5  # s between two looks at the publishers of the topics
 N_POSES_JUDGED = 50  # newest poses whose latency and outliers are judged
-LATE = 0.2  # s: a larger median of the latency is reported
-MANY_OUTLIERS = 0.02  # share of poses outside the gate that is reported
 
 
 class PoseInputs:
@@ -154,7 +157,7 @@ class PoseInputs:
                 continue
             latency = statistics.median(age for age, _ in judged)
             outliers = statistics.fmean(refused for _, refused in judged)
-            if LATE < latency < 10.0:  # beyond, a bag is replayed on another clock
+            if LATE_POSE < latency < 10.0:  # beyond, a bag is replayed on another clock
                 return WARN, f'poses of {name} come {latency:.2f} s after their stamps'
             if outliers > MANY_OUTLIERS:
                 return WARN, f'{outliers:.0%} of the poses of {name} are outliers'

@@ -1,0 +1,185 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses of neighbors by another detector: published, in time, and used by the same gates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from flock_follower.checks.findings import ERROR, Finding, first, OK, UNMEASURED, WARNING
+from flock_follower.checks.observations import Observations, SourceSeen, TopicSeen
+from flock_follower.checks.streams import check_latency, check_rate
+from flock_follower.geometry import quaternion_to_matrix, Transform
+from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.neighbors_file import NeighborConfig
+from flock_follower.odometry.static_frames import StaticFrames
+from flock_follower.perception.neighbor_filter import UpdateOutcome
+from flock_follower.perception.pending_images import Perceiver
+from flock_follower.perception.pose_sources import LATE_POSE, MANY_OUTLIERS, Sourced
+from flock_follower.perception.tracker import Tracker
+from flock_follower.pose_messages import POSE_TYPES, PoseState
+from flock_follower.topic_names import full_name
+
+MOST_REFUSED: Final = 0.5  # share of refused poses from which on there is an error
+MAX_LATENCY: Final = 0.4  # s: a larger median is an error
+MIN_RATE: Final = 7.0  # Hz, of a neighbor in sight; slower poses were not flown
+MOST_JUDGED: Final = 600  # poses of a neighbor: each takes about a millisecond
+MAX_WAIT: Final = 0.35  # s: the longest wait of a pose for odometry
+MIN_COS_SIGHT: Final = 0.26  # cosine of the angle, 75 degrees, from the optical axis
+MIN_COS_TILT: Final = 0.7  # cosine of the angle, 45 degrees, of a body from the vertical
+MIN_USED: Final = 10  # poses: of fewer, outliers and axes are not judged
+
+
+class Arrival(NamedTuple):
+    """A pose, and when it came, s."""
+
+    time: float
+    pose: PoseState
+
+
+def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]],
+                states: Iterable[OdometryState], cameras: Mapping[str, Transform],
+                static: StaticFrames) -> dict[str, SourceSeen]:
+    """
+    Return the outcome of the poses of each neighbor in the filter and gates of relative_pose.
+
+    :param cameras: the optical frames of the own cameras on the body, by name.
+    """
+    perceiver = Perceiver(Tracker(config, Transform()), max_wait=MAX_WAIT)
+    perceiver.sources.frames.update(cameras)
+    perceiver.sources.static = static
+    seen = {n.name: SourceSeen(n.source.topic) for n in config.neighbors if n.source is not None}
+    frames = dict.fromkeys(seen, '')
+    waiting = iter(sorted(states, key=lambda state: state.stamp))
+    state = next(waiting, None)
+    ordered = sorted(((arrival, name) for name, those in arrivals.items() for arrival in those),
+                     key=lambda each: each[0].time)
+    for (time, pose), name in ordered:
+        its = seen[name]
+        if its.taken >= MOST_JUDGED:
+            continue
+        while state is not None and state.stamp <= time * NANOSECONDS:
+            perceiver.take_odometry(state)
+            state = next(waiting, None)
+        its.taken += 1
+        frames[name] = pose.frame
+        if (refused := perceiver.take_pose(name, pose, time)) is not None:
+            its.refused[refused[0]] += 1
+        elif pose.frame in cameras:
+            its.outside += bool(
+                pose.position[2] < MIN_COS_SIGHT * np.linalg.norm(pose.position))
+        for outcome in perceiver.sources.due(time):
+            if isinstance(outcome, Sourced):
+                _count(seen[outcome.name], outcome)
+    for name, its in seen.items():
+        its.frame = frames[name]
+    return seen
+
+
+def _count(its: SourceSeen, outcome: Sourced) -> None:
+    its.used += 1
+    its.outliers += any(reason == UpdateOutcome.OUTLIER.value
+                        for reason, _ in outcome.sighting.rejections)
+    estimate = outcome.sighting.estimates.get(outcome.name)
+    if estimate is not None:
+        its.tilted += bool(quaternion_to_matrix(estimate.quaternion)[2, 2] < MIN_COS_TILT)
+
+
+def check_poses(seen: Observations) -> Iterator[Finding]:
+    """Check the poses of the neighbors that another detector measures."""
+    if seen.frames_topic:
+        yield _check_frames(seen)
+    for name, its in seen.sources.items():
+        if not its.topic:
+            continue
+        what, topic = f'poses of {name}', seen.topics.get(
+            full_name(its.topic, seen.namespace), TopicSeen())
+        yield _check_published(seen, what, its, topic)
+        if topic.arrivals:
+            yield check_rate(seen, what, topic, (MIN_RATE, 0.0),
+                             'raise the rate of the detector; hold the neighbor in its sight')
+            yield check_latency(
+                seen, what, topic, (LATE_POSE, MAX_LATENCY),
+                'give the detector more processor time, or smaller images; the follower acts on '
+                'where its neighbor was')
+            yield _check_use(what, its)
+            yield _check_outliers(what, its)
+            yield _check_axes(what, its)
+
+
+def _check_frames(seen: Observations) -> Finding:
+    """Check the topic of the stamps of the images that the detector processes."""
+    full = full_name(seen.frames_topic, seen.namespace)
+    return first(
+        'frames_topic', 'published',
+        (full not in seen.topics, ERROR, f'the bag lacks {full}' if not seen.live else
+         f'no node publishes {full}', 'name a topic of the detector that comes with each image'),
+        (True, OK, full, ''))
+
+
+def _check_published(seen: Observations, what: str, its: SourceSeen, topic: TopicSeen) -> Finding:
+    full = full_name(its.topic, seen.namespace)
+    number = len(topic.publishers)
+    return first(
+        what, 'one publisher of poses',
+        (not number and not seen.live, ERROR, f'the bag lacks {full}', 'record it'),
+        (not number, ERROR, f'no node publishes {full}', 'start the other detector'),
+        (number > 1, ERROR, f'{number} publishers of {full}: none is used', 'end all but one'),
+        (not {*POSE_TYPES} & {*topic.types}, ERROR, f'{full} holds {", ".join(topic.types)}',
+         f'have it send {POSE_TYPES[0]}'),
+        (True, OK, f'{full}; without a marker the guard keeps no viewing angle', ''))
+
+
+def _check_use(what: str, its: SourceSeen) -> Finding:
+    """Check that poses are not refused."""
+    refused = its.refused.total()
+    measured = ', '.join(f'{number} of {its.taken}: {reason}'
+                         for reason, number in its.refused.most_common())
+    return first(
+        f'{what} used', 'none refused',
+        (not its.taken, UNMEASURED, 'none was read', ''),
+        (refused > MOST_REFUSED * its.taken, ERROR, measured,
+         'see the table of reasons in docs/other_packages.md'),
+        (refused, WARNING, measured, 'see the table of reasons in docs/other_packages.md'),
+        (True, OK, f'{its.taken} poses, in frame {its.frame or "?"}', ''))
+
+
+def _check_outliers(what: str, its: SourceSeen) -> Finding:
+    share = its.outliers / max(its.used, 1)
+    return first(
+        f'{what} outliers', f'at most {MANY_OUTLIERS:.0%}',
+        (its.used < MIN_USED, UNMEASURED, f'{its.used} poses are too few', ''),
+        (share > MANY_OUTLIERS, WARNING, f'{share:.1%} are outside the gate of the filter',
+         'raise the threshold of the detector; is the covariance of its poses honest?'),
+        (True, OK, f'{share:.1%}', ''))
+
+
+def _check_axes(what: str, its: SourceSeen) -> Finding:
+    """Check that the neighbor is before the camera, and that its body is upright."""
+    tilt = math.degrees(math.acos(MIN_COS_TILT))
+    return first(
+        f'{what} axes', 'optical axes in a camera frame; the body is x ahead, y left, z up',
+        (its.used < MIN_USED, UNMEASURED, f'{its.used} poses are too few', ''),
+        (2 * its.outside > its.used, ERROR,
+         f'{its.outside} of {its.taken} are not before the camera {its.frame}',
+         'send x right, y down, z ahead; or name the frame whose axes these are'),
+        (2 * its.tilted > its.used, WARNING,
+         f'the body is tilted by more than {tilt:.0f} degrees in {its.tilted} of {its.used}',
+         'send the attitude of the body, not of its marker; or set position_only'),
+        (True, OK, f'before the camera, upright in {its.used - its.tilted} of {its.used}', ''))

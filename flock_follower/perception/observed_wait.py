@@ -1,0 +1,51 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The longest time for which a message waits for another one, from the waits observed."""
+
+from __future__ import annotations
+
+from collections import deque
+
+#: A message is late after LATE_FACTOR times the longest observed wait, and LATE_MARGIN.
+LATE_FACTOR = 1.5
+LATE_MARGIN = 0.03  # s
+N_OBSERVED = 50  # newest waits that count
+
+
+class ObservedWait:
+    """
+    Waits a little longer than was necessary lately, and never longer than ``max_wait``.
+
+    :param needed: number of observed waits before the limit is shorter than ``max_wait``, s.
+    """
+
+    def __init__(self, max_wait: float, needed: int = N_OBSERVED) -> None:
+        self._max_wait, self._needed = max_wait, needed
+        self._waits: deque[float] = deque(maxlen=N_OBSERVED)
+
+    @property
+    def limit(self) -> float:
+        """Return for how long to wait now, s."""
+        if len(self._waits) < self._needed:
+            return self._max_wait
+        return min(LATE_FACTOR * max(self._waits) + LATE_MARGIN, self._max_wait)
+
+    def observe(self, waited: float) -> None:
+        """Take a wait that ended with the awaited message, s."""
+        self._waits.append(waited)
+
+    def forget(self) -> None:
+        """Forget the observed waits: the awaited message may be later from now on."""
+        self._waits.clear()

@@ -1,0 +1,119 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses of another detector in ``check``: latency, outliers, refusals and axes have their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flock_follower.bags.message_types import empty
+from flock_follower.checks.collector import Collector, POSES
+from flock_follower.checks.findings import ERROR, OK, UNMEASURED, WARNING
+from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
+from flock_follower.checks.pose_topics import check_poses
+from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
+from flock_follower.messages import odometry, to_nanoseconds
+from flock_follower.neighbors_file import parse
+from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME
+from flock_follower.perception.tracker import camera_mounting
+from flock_follower.pose_messages import POSE, pose_with_covariance
+from flock_follower.topic_names import names_there
+
+START = 1_700_000_000.0  # s
+IN_CAMERA = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0]).inverse() @ Transform(
+    translation=np.array([2.0, 0.2, 0.1]))
+COVARIANCE = np.diag([0.03**2] * 3 + [0.1**2] * 3)
+#: The body's axes as REP-103 has them, in a message that names the optical frame.
+FLU = Transform(translation=np.array([1.9, 0.2, 0.1]))
+TURNED = Transform(IN_CAMERA.rotation @ quaternion_to_matrix(
+    quaternion_from_rpy(1.5, 0.0, 0.0)), IN_CAMERA.translation)
+Change = Callable[[Any, int], Any]
+
+
+def levels(change: Change = lambda message, k: message, latency: float = 0.03,
+           pose: Transform = IN_CAMERA, frames_topic: str = '') -> tuple[Observations,
+                                                                        dict[str, str]]:
+    """Return the observations of a hovering pair, and the level of each row."""
+    random = np.random.default_rng(2)
+    seen = Observations(live=False, names=names_there('', {}), topics={
+        '/odom': TopicSeen(), '/poses': TopicSeen([TopicEnd('', POSE)])},
+        parameters={'relative_pose': {'camera_position': [0.1, 0.0, 0.0]}})
+    collector = Collector(seen, 6.0)
+    info = empty('sensor_msgs/msg/CameraInfo')
+    info.header.frame_id = 'optical'
+    seen.calibration = info
+    for k in range(300):
+        stamp = START + k / 50.0
+        collector.take('odom', '/odom', odometry(
+            empty, to_nanoseconds(stamp), 'odom', 'base_link', [0.0, 0.0, 1.0],
+            [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0]), stamp)
+        if k % 5 == 0:
+            error: Array = random.normal(0.0, 0.03, 3)
+            message = change(pose_with_covariance(
+                empty, to_nanoseconds(stamp), 'optical',
+                Transform(pose.rotation, pose.translation + error), COVARIANCE), k // 5)
+            collector.take(POSES, '/poses', message, stamp + latency)
+    collector.finish(parse({'neighbors': [{'name': 'leader', 'pose_topic': 'poses'}],
+                            **({'frames_topic': frames_topic} if frames_topic else {})}))
+    return seen, {finding.what.removeprefix('poses of leader').strip(): finding.level
+                  for finding in check_poses(seen)}
+
+
+def outlier(message: Any, k: int) -> Any:
+    if k % 20 == 7:
+        message.pose.pose.position.z += 1.0
+    return message
+
+
+def in_frame(message: Any, k: int) -> Any:
+    message.header.frame_id = 'map'
+    return message
+
+
+def without_attitude(message: Any, k: int) -> Any:
+    if k % 10 == 0:
+        message.pose.pose.orientation.w = message.pose.pose.orientation.x = 0.0
+        message.pose.pose.orientation.y = message.pose.pose.orientation.z = 0.0
+    return message
+
+
+def test_poses_that_are_well_have_no_fault() -> None:
+    seen, rows = levels()
+    assert rows == {'': OK, 'rate': OK, 'latency': OK, 'used': OK, 'outliers': OK, 'axes': OK}
+    assert seen.sources['leader'].taken == 60
+
+
+@pytest.mark.parametrize(('options', 'faults'), [
+    ({'latency': 0.15}, {'latency': WARNING}),
+    ({'latency': 0.5}, {'latency': ERROR}),
+    ({'change': outlier}, {'outliers': WARNING}),
+    ({'change': outlier, 'latency': 0.15}, {'outliers': WARNING, 'latency': WARNING}),
+    ({'change': in_frame}, {'used': ERROR, 'outliers': UNMEASURED, 'axes': UNMEASURED}),
+    ({'change': without_attitude}, {'used': WARNING}),
+    ({'pose': FLU}, {'axes': ERROR}),
+    ({'pose': TURNED}, {'axes': WARNING}),
+    ({'frames_topic': 'none'}, {'frames_topic': ERROR})])
+def test_each_fault_of_poses_has_its_row(options: dict[str, Any], faults: dict[str, str]) -> None:
+    _, rows = levels(**options)
+    assert {what: level for what, level in rows.items() if level != OK} == faults
+
+
+def test_refused_poses_are_counted_by_their_reasons() -> None:
+    assert levels(in_frame)[0].sources['leader'].refused == {UNKNOWN_FRAME: 60}
+    assert levels(without_attitude)[0].sources['leader'].refused == {NO_ATTITUDE: 6}
