@@ -62,6 +62,7 @@ ADVICE: Final[Mapping[str, str]] = {
     'no publisher': 'start its publisher, or connect its name (above)',
     UNDELIVERED: 'run publisher and nodes as one user with one /dev/shm; restart the nodes whose '
                  'shared memory was removed (docs/deploy.md)',
+    'only one may': 'end all but one, or remap them',
     'none sending': 'look at the log of its publisher',
     'not in sight': 'hold the leader before the camera',
     'QoS mismatch': 'change the QoS of the publisher',

@@ -31,6 +31,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations, TopicSeen
 from flock_follower.checks.reach import Reach
+from flock_follower.parameters.sections import listed_files
 from flock_follower.pose_messages import POSE_TYPES
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS, RAW_IMAGES, TYPES
@@ -123,8 +124,7 @@ def check_nodes(seen: Observations) -> Finding:
 def _files(seen: Observations, node: str) -> str:
     """Return the different parameter files of nodes with one name as text; '' if they agree."""
     files = seen.files.get(full_name(node, seen.namespace).lstrip('/'), [])
-    return f' (with {" and with ".join(each or "no file" for each in files)})' if (
-        len(files) > 1) else ''
+    return f' ({listed_files(files)})' if len(files) > 1 else ''
 
 
 def _clocks(seen: Observations) -> Iterator[Finding]:
