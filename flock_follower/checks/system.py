@@ -132,7 +132,7 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
 
 def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     """Report the state of the autopilot, by the values of the bridge's diagnostics."""
-    link, silent = values.get('link', 'not reported'), values.get(NO_ANSWERS, '')
+    link, silent = values.get('link', 'not reported'), values.get(NO_ANSWERS)
     fault = values.get(LINK_FAULT, '')
     vehicle = ', '.join(values.get(key) or f'no {key}' for key in ('autopilot', 'mode'))
     yield first(
@@ -141,6 +141,7 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
          'connection and target_system; set the port of the autopilot to MAVLink both ways'),
         (link != 'alive', ERROR, f'not received ({link})', fault or 'check cable, connection and '
          'baud rate; is the autopilot on, is its MAVLink port set up?'),
+        (silent is None, UNMEASURED, f'{vehicle}: whether it answers is not reported', ''),
         (fault, WARNING, vehicle, fault), (True, OK, vehicle, ''))
     if silent or link != 'alive':
         return

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -255,7 +255,7 @@ def _publishers(seen: Observations) -> Iterator[Finding]:
     yield _check_network(seen.machine.reach)
 
 
-def _check_network(reach: Iterable[tuple[str, Reach | None]]) -> Finding:
+def _check_network(reach: Sequence[tuple[str, Reach | None]]) -> Finding:
     """Check that our nodes are reached from this computer alone."""
     found, addressed, unknown = (
         ', '.join(sorted({node for node, its in reach if its is wanted}))
@@ -268,5 +268,6 @@ def _check_network(reach: Iterable[tuple[str, Reach | None]]) -> Finding:
         (addressed, WARNING, 'a computer that names the address of this one as a peer can '
          f'command: it reaches {addressed}', 'start every node with config/dds/fastdds.xml; a '
          'flock with peers needs a firewall: see docs/deploy.md'),
-        (unknown, UNMEASURED, f'no socket of DDS is seen in {unknown}', ''),
+        (unknown or not reach, UNMEASURED, f'no socket of DDS is seen in {unknown or "any node"}',
+         ''),
         (True, OK, 'ROS stays on this computer', ''))
