@@ -26,7 +26,6 @@ from collections.abc import Sequence
 from functools import partial
 import ipaddress
 import math
-from pathlib import Path
 import select
 import signal
 import socket
@@ -37,6 +36,7 @@ from typing import Any
 from flock_desk.runs.console import guarded, within
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
 from flock_desk.vehicles.profiles import PROFILES
+from flock_follower.files import read_text
 from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
@@ -116,7 +116,7 @@ def settings(options: argparse.Namespace) -> dict[str, Any]:
     parameters = {}
     version = PROFILES[options.personality].version(options.firmware)
     if options.param_file:
-        text = Path(options.param_file).read_text(encoding='utf-8')
+        text = read_text(options.param_file)
         parameters.update({entry.name: entry.value for entry in read_recommendations(
             text, forwarding=False) if entry.applies(Version(*map(int, version.split('.'))))})
     for text in options.param:

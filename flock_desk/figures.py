@@ -43,6 +43,7 @@ from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs import paper_plots as plots
 from flock_desk.runs.console import aligned, guarded, progress
+from flock_follower.files import read_text
 from flock_follower.whole_file import whole_file
 
 MODELS: dict[Model, str] = {
@@ -52,6 +53,8 @@ MODELS: dict[Model, str] = {
     'vicsek': 'Vicsek, own speed kept',
     'vicsek_mean_velocity': 'Vicsek, velocities averaged',
 }
+#: Where `flights` writes its results, if no other folder is given.
+CAMPAIGN = Path('build/flights/flights.json')
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
@@ -79,8 +82,8 @@ def main(args: Sequence[str] | None = None) -> int:
         prog='figures', description='Redraw the figures of the paper, or one larger flock.')
     parser.add_argument('--output', '--out', type=Path, default='build/figures',
                         help='folder of the pictures (default: %(default)s)')
-    parser.add_argument('--campaign', type=Path, default='build/flights/flights.json',
-                        metavar='FILE', help='results of flights; %(default)s')
+    parser.add_argument('--campaign', type=Path, metavar='FILE',
+                        help=f'results of flights (default: {CAMPAIGN}, if it exists)')
     parser.add_argument('--agents', type=int, metavar='N',
                         help='one larger flock of so many, instead of the paper')
     parser.add_argument('--dim', type=int, choices=(2, 3), default=2,
@@ -90,11 +93,14 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _draw(options: argparse.Namespace) -> int:
+    if options.campaign is not None:
+        read_text(options.campaign)  # if it cannot be read, nothing is drawn in vain
     options.output.mkdir(parents=True, exist_ok=True)
     if options.agents is not None:
         written = one_flock(options.output, options.agents, options.dim, options.seed)
     else:
-        written = [*redraw(options.output), *redraw_controllers(options.output, options.campaign)]
+        written = [*redraw(options.output), *redraw_controllers(
+            options.output, options.campaign or CAMPAIGN)]
     print(f'written to {options.output}: {", ".join(written)}')
     return 0
 
@@ -137,7 +143,7 @@ def redraw_controllers(out: Path, path: Path) -> list[str]:
 
     :param path: flights.json of ``flights``; only scenarios that all controllers flew count.
     """
-    results = json.loads(path.read_text()) if path.exists() else {}
+    results = json.loads(read_text(path)) if path.exists() else {}
     flown = sorted((round(each['law']['max_speed_m_s'] / each['law']['max_speed_share'], 3), name)
                    for name, each in results.items() if CONTROLLERS.keys() <= each.keys())
     if not flown:

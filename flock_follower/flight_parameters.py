@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from flock_follower.mavlink.connection import parse_connection
-from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
-from flock_follower.parameters.files import read_parameters
-from flock_follower.perception.markers import load
-from flock_follower.perception.parameter_table import RELATIVE_POSE
-from flock_follower.planner.parameter_table import PLANNER
+from flock_follower.mavlink.link import Signing
+from flock_follower.mavlink.parameter_table import gate_limits, MAVLINK_BRIDGE, origin
+from flock_follower.parameters.files import effective_parameters, read_parameters
+from flock_follower.perception.parameter_table import RELATIVE_POSE, tracker
+from flock_follower.planner.parameter_table import PLANNER, planner_params
 
 #: The tables by the name of the node.
 TABLE: Final = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER,
@@ -33,19 +33,25 @@ TABLE: Final = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER,
 
 
 def refuse_start(files: Sequence[str | Path], given: Mapping[str, Mapping[str, Any]],
-                 neighbors: str | Path) -> None:
+                 namespace: str) -> None:
     """
     Refuse what would end a node at each start: a launch would start it again for ever.
 
     :param files: parameter files. :param given: values of parameters beside them, by node.
-    :param neighbors: the neighbors file.
+    :param namespace: of the nodes.
     :raises ValueError, OSError: naming the file or the parameter.
     """
     for path in files:
         read_parameters(path, TABLE)
-    load(neighbors)
-    for node, values in given.items():
-        for spec in TABLE.get(node, ()):
-            if spec.name in values:
-                spec.check(values[spec.name])
-    parse_connection(given['mavlink_bridge']['connection'])
+    space = namespace.strip('/')
+    values = {node: effective_parameters(
+        files, given.get(node, {}), f'/{space}/{node}' if space else f'/{node}', specs)
+        for node, specs in TABLE.items()}
+    tracker(values['relative_pose'])
+    planner_params(values['planner'], space)
+    own = values['mavlink_bridge']
+    gate_limits(own)
+    origin(own['global_origin'])
+    parse_connection(own['connection'])
+    if own['signing_key_file']:
+        Signing.from_file(own['signing_key_file'], 0.0)

@@ -16,7 +16,8 @@
 Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a black box.
 
 An argument left empty leaves its parameter as the parameter files have it. A file that is missing
-and a value that no node takes end the launch; a node that ends later is started again.
+and parameters with which a node would end at its start end the launch; a node that ends later is
+started again.
 camera.launch.py includes it with the topics and the mounting of a known camera and odometry
 (docs/sensors.md).
 """
@@ -124,7 +125,8 @@ def start(context: LaunchContext) -> list[Node]:
                         ('image_raw/compressed', f'{values["image"]}/compressed'),
                         ('camera_info', values['camera_info']), ('odom', values['odom'])]))
     # launch_ros skips a parameter file that is missing: the defaults would fly.
-    refuse_start([own, *filter(None, [values['cameras']])], given, neighbors)
+    refuse_start([own, *filter(None, [values['cameras']])], given,
+                 values['namespace'])
     return started
 
 

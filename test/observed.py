@@ -37,6 +37,7 @@ from flock_follower.checks.observations import (
     TopicSeen,
 )
 from flock_follower.checks.processor import Load
+from flock_follower.checks.reach import Reach
 from flock_follower.checks.recorded_system import judge_all
 from flock_follower.files import resource
 from flock_follower.flight_parameters import TABLE
@@ -222,7 +223,8 @@ def _healthy(live: bool) -> Observed:
         shifts=shift_rows(), sightings=sighting_rows(), marker_sides={0: 0.16},
         statuses={node: NodeStatus(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
                   for node in OURS} if live else {},
-        machine=Machine(Load(0.01, 0.4, 4), 8000.0, 512 * 1024, domain='0'))
+        machine=Machine(Load(0.01, 0.4, 4), 8000.0, 512 * 1024, domain='0',
+                        reach=[('planner', Reach.COMPUTER)]))
 
 
 BRIDGE = {'link': 'alive', 'autopilot': 'PX4', 'mode': 'POSCTL', 'armed': 'False',

@@ -161,6 +161,26 @@ def test_a_value_that_no_node_takes_ends_the_launch_instead_of_starting_nodes_fo
         launched(FOLLOWER, **{argument: text})
 
 
+@pytest.mark.parametrize(('node', 'setting', 'arguments', 'said'), [
+    ('planner', 'd0: 9.0', {}, 'd0 = 9.0'),
+    ('planner', 'v_max: 1.5', {'a_max': '1.5'}, 'a_max = 1.5'),
+    ('mavlink_bridge', 'v_max: 1.5', {'a_max': '1.5'}, 'a_max = 1.5'),
+    ('mavlink_bridge', 'signing_key_file: /nowhere', {}, "signing_key_file = '/nowhere'"),
+    ('mavlink_bridge', 'global_origin: [91.0, 8.5, 4.0]', {}, 'latitude'),
+    ('relative_pose', 'odometry: none', {'cameras': '{}/two_cameras.yaml'}, 'odometry = none')])
+def test_what_would_end_a_node_at_each_start_ends_the_launch(
+        config: Path, node: str, setting: str, arguments: dict[str, str], said: str) -> None:
+    given = {name: text.format(config) for name, text in arguments.items()}
+    own = config / 'follower.yaml'
+    text = own.read_text()
+    for vehicle in ('other', 'mine'):  # what another vehicle has ends nothing
+        own.write_text(f'{text}/{vehicle}/{node}: {{ros__parameters: {{{setting}}}}}\n')
+        if vehicle == 'other':
+            launched(FOLLOWER, config=str(config), namespace='mine', **given)
+    with pytest.raises(ValueError, match=re.escape(said)):
+        launched(FOLLOWER, config=str(config), namespace='mine', **given)
+
+
 def test_an_argument_left_empty_leaves_its_parameter_to_the_files(config: Path) -> None:
     own, two = str(config / 'follower.yaml'), str(config / 'two_cameras.yaml')
     nodes, _ = launched(FOLLOWER, config=str(config), cameras=two)

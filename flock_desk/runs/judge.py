@@ -35,6 +35,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from flock_follower.files import read_text
+
 #: Keys under which anything may appear, a count of 0 unless it does.
 COUNTERS = ('rejections.', 'setpoints.reasons.')
 
@@ -79,7 +81,7 @@ def load_bounds(path: str | Path) -> list[FigureBound]:
     :raises OSError: if the file cannot be read.
     """
     try:
-        return parse_bounds(yaml.safe_load(Path(path).read_text(encoding='utf-8')))
+        return parse_bounds(yaml.safe_load(read_text(path)))
     except (yaml.YAMLError, ValueError) as error:
         raise ValueError(f'{path}: {" ".join(str(error).split())}') from None
 

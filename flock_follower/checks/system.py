@@ -62,6 +62,7 @@ ADVICE: Final[Mapping[str, str]] = {
     'no publisher': 'start its publisher, or connect its name (above)',
     UNDELIVERED: 'run publisher and nodes as one user with one /dev/shm; restart the nodes whose '
                  'shared memory was removed (docs/deploy.md)',
+    'only one may': 'end all but one, or remap them',
     'none sending': 'look at the log of its publisher',
     'not in sight': 'hold the leader before the camera',
     'QoS mismatch': 'change the QoS of the publisher',
@@ -131,7 +132,7 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
 
 def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     """Report the state of the autopilot, by the values of the bridge's diagnostics."""
-    link, silent = values.get('link', 'not reported'), values.get(NO_ANSWERS, '')
+    link, silent = values.get('link', 'not reported'), values.get(NO_ANSWERS)
     fault = values.get(LINK_FAULT, '')
     vehicle = ', '.join(values.get(key) or f'no {key}' for key in ('autopilot', 'mode'))
     yield first(
@@ -140,6 +141,7 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
          'connection and target_system; set the port of the autopilot to MAVLink both ways'),
         (link != 'alive', ERROR, f'not received ({link})', fault or 'check cable, connection and '
          'baud rate; is the autopilot on, is its MAVLink port set up?'),
+        (silent is None, UNMEASURED, f'{vehicle}: whether it answers is not reported', ''),
         (fault, WARNING, vehicle, fault), (True, OK, vehicle, ''))
     if silent or link != 'alive':
         return

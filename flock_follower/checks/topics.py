@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from flock_follower.checks.findings import (
@@ -31,6 +31,7 @@ from flock_follower.checks.observations import Observations
 from flock_follower.checks.pose_topics import check_poses
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.streams import check_stream
+from flock_follower.parameters.sections import listed_files
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS, RAW_IMAGES, TYPES
 
@@ -94,8 +95,7 @@ def check_nodes(seen: Observations) -> Finding:
 def _files(seen: Observations, node: str) -> str:
     """Return the different parameter files of nodes with one name as text; '' if they agree."""
     files = seen.files.get(full_name(node, seen.namespace).lstrip('/'), [])
-    return f' (with {" and with ".join(each or "no file" for each in files)})' if (
-        len(files) > 1) else ''
+    return f' ({listed_files(files)})' if len(files) > 1 else ''
 
 
 def _clocks(seen: Observations) -> Iterator[Finding]:
@@ -163,7 +163,7 @@ def _publishers(seen: Observations) -> Iterator[Finding]:
     yield _check_network(seen.machine.reach)
 
 
-def _check_network(reach: Iterable[tuple[str, Reach | None]]) -> Finding:
+def _check_network(reach: Sequence[tuple[str, Reach | None]]) -> Finding:
     """Check that our nodes are reached from this computer alone."""
     found, addressed, unknown = (
         ', '.join(sorted({node for node, its in reach if its is wanted}))
@@ -176,5 +176,6 @@ def _check_network(reach: Iterable[tuple[str, Reach | None]]) -> Finding:
         (addressed, WARNING, 'a computer that names the address of this one as a peer can '
          f'command: it reaches {addressed}', 'start every node with config/dds/fastdds.xml; a '
          'flock with peers needs a firewall: see docs/deploy.md'),
-        (unknown, UNMEASURED, f'no socket of DDS is seen in {unknown}', ''),
+        (unknown or not reach, UNMEASURED, f'no socket of DDS is seen in {unknown or "any node"}',
+         ''),
         (True, OK, 'ROS stays on this computer', ''))

@@ -82,13 +82,18 @@ class Requests:
         mode = '' if status is None or status.armed else status.mode
         return self.begin(lambda dialect: commands.arm(dialect, value, mode, streaming), now)
 
-    def offboard(self, value: bool, now: float) -> Request:
-        """Let the vehicle fly our setpoints, or hold its position."""
+    def offboard(self, value: bool, now: float, obstacle: str = '') -> Request:
+        """
+        Let the vehicle fly our setpoints, or hold its position.
+
+        :param obstacle: why setpoints would not be those of one commander, or ''.
+        """
         self._end.begin()
         if not value:
             return self.begin(commands.hold, now)
         flies = self._gate.permission.phase is Phase.ACTIVE
-        return self.begin(commands.offboard, now, '' if flies else self.offboard_obstacle(now))
+        return self.begin(commands.offboard, now, '' if flies else (
+            obstacle or self.offboard_obstacle(now)))
 
     def land(self, now: float) -> Request:
         """Land here."""

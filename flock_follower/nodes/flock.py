@@ -34,10 +34,11 @@ from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import checked_name
 from flock_follower.messages import from_odometry, from_state, OdometryState
 from flock_follower.nodes.support.conversions import make
-from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
+from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.nodes.support.sole_publisher import SolePublisher
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import Spec, specs_of
 
@@ -70,7 +71,8 @@ class SharingNode(FlockNode):
         self._received = self.create_publisher(Odometry, RECEIVED_TOPIC, QoSProfile(depth=10))
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False)
         self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
-        self.diagnostics.checks += [self._silence_problem, self._sender_problem, self._rivals]
+        self.diagnostics.checks += [self._silence_problem, self._sender_problem,
+                                    SolePublisher(self, RECEIVED_TOPIC).problem]
         self.diagnostics.sources.append(self._senders)
         self.get_logger().info(f'this is {parameters.current}')
         self._timer = self.create_timer(PERIOD, self._tick)
@@ -117,9 +119,6 @@ class SharingNode(FlockNode):
         return {f'frame of {name}': each.unusable(current) or (
             'known to {:.3f} m, {:.3f} rad'.format(*each.frame.stds) if each.frame else '')
             for name, each in self._sharing.senders.items()}
-
-    def _rivals(self, now: float) -> Problem | None:
-        return rivals(self, RECEIVED_TOPIC, 'publish on {}')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -64,12 +64,7 @@ from flock_follower.mavlink.status_texts import DISTANCE_PERIOD
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import OdometryState, stamp_age
 from flock_follower.nodes.support.bridge_report import BridgeReport
-from flock_follower.nodes.support.diagnostics import (
-    internal_error,
-    listed,
-    publishers,
-    STEADY,
-)
+from flock_follower.nodes.support.diagnostics import internal_error, STEADY
 from flock_follower.nodes.support.even_clock import EvenClock
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
@@ -214,8 +209,7 @@ class MavlinkBridge(FlockNode):
         # The time of arrival: two commands that arrived far apart may both have waited.
         waited = max(time.time_ns() - received, 0) * 1e-9 if received else 0.0
         if self._sources.another(number, now - waited) and self._flying():
-            topic = self.resolve_topic_name('command/trajectory')
-            who = f'{listed(publishers(self, topic))} on {topic}'
+            who = self._report.problems.commanders.publishers()
             gate = self._bridge.gate
             self._stream.submit(lambda: gate.permit(gate.permission.contested(who)))
 
@@ -248,10 +242,10 @@ class MavlinkBridge(FlockNode):
 
     async def _serve(self, name: str, request: Any, response: Any) -> Any:
         """Answer a service once the autopilot shows the result."""
-        requests = self._bridge.requests
+        requests, rivals = self._bridge.requests, self._report.problems.commanders.conflict()
         ask: dict[str, Callable[[float], Request]] = {
             'arm': lambda now: requests.arm(request.data, now),
-            'offboard': lambda now: requests.offboard(request.data, now),
+            'offboard': lambda now: requests.offboard(request.data, now, rivals),
             'takeoff': lambda now: requests.takeoff(self._settings.values['takeoff_height'], now),
             'land': requests.land}
         call = _Call()

@@ -57,13 +57,14 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
-from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.even_clock import EvenClock
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.nodes.support.sole_publisher import SolePublisher
 from flock_follower.parameters.cameras import cameras
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
@@ -128,6 +129,7 @@ class Planner(FlockNode):
         self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self._bridge_parameters = WatchedParameters(
             self, 'mavlink_bridge', lambda: time.monotonic() - self._flown < FLOWN_TIME)
+        self._bridge_publishers = SolePublisher(self, BRIDGE_TOPIC)
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem,
             self._bridge_changed]
@@ -307,7 +309,7 @@ class Planner(FlockNode):
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:
             return None
-        return rivals(self, BRIDGE_TOPIC, 'publish the bridge state on {}')
+        return self._bridge_publishers.problem(now)
 
     def _bridge_changed(self, now: float) -> Problem | None:
         changed = self._bridge_parameters.changed_in_flight(now)

@@ -29,6 +29,7 @@ from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.sections import (
     ALL_NODES,
     last,
+    means,
     names,
     naming,
     read,
@@ -77,6 +78,27 @@ def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | Non
         if own.get('neighbors_file'):
             own['neighbors_file'] = str(path.parent / own['neighbors_file'])
     return values
+
+
+def effective_parameters(paths: Sequence[str | Path], given: Mapping[str, Any], node: str,
+                         specs: Sequence[Spec]) -> dict[str, Any]:
+    """
+    Return the checked values with which a node starts, defaults included.
+
+    :param paths: its parameter files; the last setting wins, as in ROS. :param given: parameters
+        set beside them, which win. :param node: its full name. :param specs: of its parameters.
+    :raises ValueError: naming the parameter, its value and the valid range, or the file.
+    :raises OSError: if a file cannot be read.
+    """
+    found: dict[str, Any] = {}
+    for path in paths:
+        with naming(path):
+            for section, values in read_sections(read(path)):
+                if means(section, node):
+                    found |= values
+    found |= given
+    known = names(specs, found)
+    return check_values(specs, {name: found[name] for name in found if name in known})
 
 
 def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:

@@ -68,6 +68,11 @@ def names_for_any_node(paths: Sequence[str | Path], node: str, specs: Sequence[S
     return found
 
 
+def listed_files(files: Sequence[str]) -> str:
+    """Return the parameter files of nodes with one name as text; '' is a node without one."""
+    return ' and '.join(f'with {each or "no file"}' for each in files)
+
+
 def files_in(arguments: Sequence[str]) -> list[str]:
     """Return the parameter files that a ROS command line names."""
     files, of_ros = [], False

@@ -552,6 +552,20 @@ def test_an_empty_graph_is_one_line() -> None:
     assert 'ROS_DOMAIN_ID' in finding.advice
 
 
+@pytest.mark.parametrize('live', [True, False])
+def test_what_is_not_measured_is_never_ok(live: bool) -> None:
+    known = healthy(live)
+    seen = Observations(live=live, names=known.names, nodes=known.nodes)
+    assert {finding.what for finding in judge_all(seen) if finding.level == OK} == (
+        {'nodes'} if live else set())
+    # Of the autopilot nothing is ok by a value that the bridge did not report.
+    seen = healthy(True)
+    seen.statuses['mavlink_bridge'].values = {'link': 'alive'}
+    autopilot = {'autopilot', 'answers', 'ready to arm', 'ready for offboard'}
+    found = {finding.what: finding.level for finding in seen.judged()}
+    assert {found[what] for what in autopilot} == {UNMEASURED}
+
+
 def rows(seen: Observed) -> dict[str, str]:
     return {finding.what: finding.level for finding in seen.judged()}
 

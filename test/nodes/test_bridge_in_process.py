@@ -27,12 +27,14 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from driven import DEADLINE, Driven, overrides, to_odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 from std_srvs.srv import SetBool, Trigger
 
+from flock_follower.bridge_state import REFUSED
 from flock_follower.command_messages import Command, trajectory
 from flock_follower.gate.setpoint_rules import COMMAND
 from flock_follower.gate.situation import Situation
@@ -44,6 +46,8 @@ from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.messages import to_array
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
+from flock_follower.nodes.support.sole_publisher import SEVERAL
+from flock_follower.parameters.sections import PARAMETER_FILES
 
 OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'take_motion', 'forward',
          'receive', 'cycle', 'stop')
@@ -216,6 +220,30 @@ def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_br
     bench.wait(lambda: any(text.startswith(begin) for text in bench.log))
     line = next(text for text in bench.log if text.startswith(begin)).removeprefix(begin)
     assert Situation.from_json(line).report.armed
+
+
+def test_offboard_is_refused_while_two_nodes_may_command_and_their_files_are_named(make_bench):
+    bench, ends = make_bench(), []
+    bench.node.get_publishers_info_by_topic = (
+        lambda topic: ends if topic == '/command/trajectory' else [])
+    bench.beat()
+    bench.wait(lambda: bench.bridge.alive(time.monotonic()))
+    for name, named in (('planner', False), ('planner', True), ('mine', True)):
+        ends.append(SimpleNamespace(node_name=name, node_namespace='/'))
+        for answer in (bench.ask('offboard', True).message, bench.values[REFUSED],
+                       bench.problems()):
+            assert (SEVERAL in answer) == named
+    assert len([s for s in bench.node.subscriptions if s.topic_name == '/diagnostics']) == 1
+    for node, file in (('planner', 'a.yaml'), ('planner', ''), ('planner', 'a.yaml'),
+                       ('drone2/planner', 'b.yaml')):
+        bench.give('/diagnostics', DiagnosticArray(status=[DiagnosticStatus(name=node, values=[
+            KeyValue(key='state', value='IDLE'), KeyValue(key=PARAMETER_FILES, value=file)])]))
+    nodes = '/mine, /planner (2 times) with a.yaml and with no file on /command/trajectory'
+    assert nodes in bench.ask('offboard', True).message
+    del ends[1:]  # all but one are ended
+    assert SEVERAL not in bench.values[REFUSED] and SEVERAL not in bench.problems()
+    assert not [s for s in bench.node.subscriptions if s.topic_name == '/diagnostics']
+    assert nodes.split()[0] not in bench.ask('offboard', True).message
 
 
 def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(make_bench):

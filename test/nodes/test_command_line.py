@@ -124,9 +124,10 @@ def test_a_start_that_fails_is_one_line_and_exit_code_1(
 
 @pytest.mark.parametrize('fault', ['missing', 'unreadable', 'a folder'])
 @pytest.mark.parametrize(('node', 'option'), [
-    ('relative_pose', '-p neighbors_file:='), ('planner', '-p neighbors_file:='),
-    ('mavlink_bridge', f'-p {BRIDGE} -p signing_key_file:='), ('planner', '--params-file '),
-    ('simulator', '-p scenario:=')])
+    *((node, f'{"-p " + BRIDGE if node == "mavlink_bridge" else ""} -p {spec.name}:=')
+      for node in NODES for spec in import_module(PROGRAMS[node]).SPECS
+      if spec.name.endswith('_file')),
+    ('planner', '--params-file '), ('simulator', '-p scenario:='), ('replay', '-p bag:=')])
 def test_a_file_that_cannot_be_read_is_refused_by_name(
         node: str, option: str, fault: str, tmp_path: Path,
         capfd: pytest.CaptureFixture[str]) -> None:

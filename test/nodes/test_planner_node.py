@@ -21,6 +21,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from driven import Driven, overrides, START, to_odometry
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 import numpy as np
@@ -33,6 +34,8 @@ from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
+from flock_follower.nodes.support.sole_publisher import SEVERAL
+from flock_follower.parameters.sections import PARAMETER_FILES
 
 STEP = 20_000_000  # ns
 AHEAD = (2.0, 0.0, 2.0)  # m: where the leader is
@@ -267,6 +270,20 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         'system clock was set', 'odom stamped before the system clock was set',
         'neighbors stamped before the system clock was set'), 1)
     rig.close()
+
+
+def test_two_bridges_are_named_with_their_parameter_files(rig):
+    ends = [SimpleNamespace(node_name='mavlink_bridge', node_namespace='/')]
+    rig.node.get_publishers_info_by_topic = (
+        lambda topic: ends if topic == '/mavlink_bridge/state' else [])
+    assert SEVERAL not in rig.problems()
+    ends *= 2
+    assert SEVERAL in rig.problems()
+    for file in ('a.yaml', 'b.yaml'):
+        rig.give('/diagnostics', DiagnosticArray(status=[DiagnosticStatus(
+            name='mavlink_bridge', values=[KeyValue(key=PARAMETER_FILES, value=file)])]))
+    assert ('/mavlink_bridge (2 times) with a.yaml and with b.yaml on /mavlink_bridge/state' in
+            rig.problems())
 
 
 def test_a_bridge_started_anew_in_flight_with_other_parameters_is_named(rig):

@@ -50,7 +50,9 @@ def redrawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, F
         return save(figure, path) if path.name == WRITTEN else path.name
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_plots, 'save', keep)
-        assert figures.main(['--output', str(out), '--campaign', str(out / 'none.json')]) == 0
+        campaign = out.parent / 'none_flown.json'
+        campaign.write_text('{}')
+        assert figures.main(['--output', str(out), '--campaign', str(campaign)]) == 0
         patch.setattr(figures, 'FLOCK_DURATION', 1.0)
         for dim in '23':
             assert figures.main(['--out', str(out / 'flocks'), '--agents', '9', '--dim', dim]) == 0

@@ -45,9 +45,10 @@ from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
-from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.nodes.support.sole_publisher import SolePublisher
 
 REPORTED_SILENCE = 3.0  # s without an autopilot after which the node reports it
 STUCK = 0.2  # s without a setpoint that was due
@@ -69,6 +70,7 @@ class BridgeProblems:
         self._last: Cycle | None = None
         self._stuck_since = math.inf
         self._bytes = (self._start, 0, 0)
+        self.commanders = SolePublisher(node, 'command/trajectory')
         self.planner = WatchedParameters(node, 'planner', self._is_armed)
         perception = WatchedParameters(node, 'relative_pose', self._is_armed)
         node.diagnostics.sources += [self._vehicle_values, self._gate_values, self._link_values]
@@ -106,7 +108,8 @@ class BridgeProblems:
             'mode': status.mode if status else '', ARMED: status.armed if status else '',
             FLYING: '' if flying is None else flying, 'state': bridge.state(now),
             'handed_over': bridge.end.why, LINK_FAULT: bridge.link.transport.fault,
-            REFUSED: bridge.refusal(now) if bridge.alive(now) else ''}
+            REFUSED: (self.commanders.conflict() or bridge.refusal(now)) if (
+                bridge.alive(now)) else ''}
         if unready is not None:
             values[NOT_READY] = unready
         if result is not None:
@@ -273,7 +276,8 @@ class BridgeProblems:
             return ERROR, (f'{permission.reason}; the bridge brakes until '
                            'mavlink_bridge/offboard true')
         # A warning: a planner that was killed and has started again is seen twice for a while.
-        return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
+        conflict = self.commanders.conflict()
+        return (WARN, conflict) if conflict else None
 
 
 def _problem(level: bytes, reason: Callable[[float], str], now: float) -> Problem | None:

@@ -54,27 +54,6 @@ def internal_error(error: Exception, where: str = '') -> str:
     return f'internal error{where and f" {where}"}: {type(error).__name__}: {error}'
 
 
-def rivals(node: Node, topic: str, doing: str, level: bytes = ERROR) -> Problem | None:
-    """Return a problem if several nodes publish on a topic that only one may publish."""
-    names = publishers(node, topic)
-    doing = doing.format(node.resolve_topic_name(topic))
-    return (level, f'{len(names)} publishers {doing}: {listed(names)}; only one may'
-            ) if len(names) > 1 else None
-
-
-def publishers(node: Node, topic: str) -> list[str]:
-    """Return the full name of the node of each publisher, also if killed up to 20 s ago."""
-    return ['(no name yet)' if 'UNKNOWN' in end.node_name else
-            f'{end.node_namespace.rstrip("/")}/{end.node_name}'
-            for end in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))]
-
-
-def listed(names: list[str]) -> str:
-    """Return names as text, each once."""
-    return ', '.join(f'{name} ({count} times)' if count > 1 else name
-                     for name, count in sorted(Counter(names).items()))
-
-
 class Rate:
     """The rate of events within the last WINDOW, and their number."""
 
