@@ -45,13 +45,13 @@ def test_braking_by_noisy_odometry_on_the_ground_takes_px4_off():
     flight = armed_on_the_ground()
     flight.fly(1.0, braking(0.005))
     assert flight.controller.landed_state == IN_AIR
-    flight.fly(30.0, braking(0.005))
+    flight.fly(20.0, braking(0.005))
     assert flight.vehicle.position[2] > 1.0
 
 
 def test_without_an_upward_setpoint_px4_idles_on_the_ground():
     flight = armed_on_the_ground()
-    flight.fly(60.0, setpoint(0.1, -0.1, 0.0))
+    flight.fly(15.0, setpoint(0.1, -0.1, 0.0))
     assert flight.vehicle.position[2] == 0.0 and flight.vehicle.thrust < 2.0
     assert flight.controller.landed_state == ON_GROUND and flight.controller.armed
 
@@ -90,6 +90,6 @@ def test_px4_that_touches_the_ground_in_offboard_does_not_count_as_landed():
 
 def test_braking_by_noisy_odometry_on_the_ground_does_not_move_arducopter():
     flight = armed_on_the_ground('arducopter')
-    flight.fly(60.0, braking(0.02))
+    flight.fly(15.0, braking(0.02))
     assert flight.vehicle.position[2] == 0.0 and flight.vehicle.thrust < 2.0
     assert flight.controller.landed_state == ON_GROUND and flight.controller.armed

@@ -188,7 +188,7 @@ def test_an_aligned_teller_is_heard_and_what_is_heard_is_not_told_on() -> None:
         sent.setdefault(name, set()).add(message.child)
         return [message]
     flock.spoil = listen
-    flock.run(8.0)
+    flock.run(4.0)
     assert sent == {f'follower_{k}': {f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER}
                     for k in range(1, 5)}
     assert set(flock.received) == {
@@ -217,7 +217,7 @@ def garbage(draw: Any) -> OdometryState | None:
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.lists(st.tuples(st.sampled_from(['own', 'seen', 'message']), garbage(), STAMPS),
                 max_size=12))
 def test_no_nonsense_breaks_it_or_comes_out_of_it(events: list[Any]) -> None:
@@ -242,7 +242,7 @@ def exchanged(order: np.random.Generator | None) -> list[Any]:
     """Return what a flock exchanges if the messages of one time come in some order."""
     flock = MadeUpFlock(Conditions('wedge', 5, attitude_std=0.03, outliers=0.05))
     found: list[Any] = []
-    for _ in range(60):
+    for _ in range(40):
         flock.run(0.1)
         if order is not None:
             flock.wire = [flock.wire[k] for k in order.permutation(len(flock.wire))]

@@ -30,10 +30,10 @@ BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
 @BOTH
 def test_no_byte_stops_the_bridge_or_gets_a_bad_setpoint_out_of_it(personality):
-    under_fire = fuzz_bridge(350_000, 1, personality)
+    under_fire = fuzz_bridge(220_000, 1, personality)
     # The fuzzing reached what it is for: the vehicle obeyed, commands passed, others did not.
     assert under_fire.sent['SET_POSITION_TARGET_LOCAL_NED'] > 100
-    assert min(under_fire.kinds[kind] for kind in ('command', 'brake', 'none')) > 5
+    assert min(under_fire.kinds[kind] for kind in ('command', 'brake', 'none')) > 3
     assert min(under_fire.sent[kind] for kind in (
         'COMMAND_LONG', 'ODOMETRY', 'PARAM_REQUEST_READ', 'TIMESYNC')) > 0
     assert min(under_fire.link.ignored[reason] for reason in (
@@ -42,7 +42,7 @@ def test_no_byte_stops_the_bridge_or_gets_a_bad_setpoint_out_of_it(personality):
 
 
 def test_with_signing_nothing_forged_is_heard():
-    under_fire = fuzz_bridge(100_000, 2, signing_key=b'0123456789abcdef' * 2)
+    under_fire = fuzz_bridge(60_000, 2, signing_key=b'0123456789abcdef' * 2)
     assert under_fire.link.ignored[BAD_SIGNATURE] > 200
     autopilot = under_fire.traffic.autopilot
     assert under_fire.link.telemetry.status.mode in autopilot.controller.PROFILE.modes

@@ -18,7 +18,7 @@ import random
 
 from bridge_flight import Flight
 from faulty_autopilot import Fault, FaultyAutopilot
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -193,6 +193,7 @@ def test_a_flight_goes_on_after_a_restart_of_the_router():
     assert flight.bridge.state(flight.now) == 'ACTIVE' and flight.kinds(5) == {'command'}
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), st.floats(0.0, 0.3), st.floats(0.0, 0.9))
 def test_one_vehicle_on_a_bad_line_is_never_two(seed, lost, delay):
     chance, identity, number, x = random.Random(seed), Identity(), 0, 0.0

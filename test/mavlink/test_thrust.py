@@ -118,7 +118,7 @@ def test_a_wrong_hover_thrust_keeps_the_height_or_is_handed_over(
     flight.loop.engage(True)
     begun = flight.leader_height = flight.heights[-1]
     flight.dies = flight.now + planner_dies
-    flight.fly_until(lambda: flight.mode != flight.modes.offboard, 14.0)
+    flight.fly_until(lambda: flight.mode != flight.modes.offboard, 11.0)
     worst = np.max(np.abs(np.array(flight.heights) - begun))
     assert worst < (0.5 if flight.handed_over is None else 1.0)
     if abs(error(12.0)) > 1.5:  # more than is offset

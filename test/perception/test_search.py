@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 from marker_images import DICTIONARY, facing, make_camera, render, SIDE
 import numpy as np
@@ -115,12 +117,19 @@ def in_uneven_light(image: GrayImage, pose: Transform, seed: int, kind: str) -> 
     return np.clip(light, 0.0, 255.0).astype(np.uint8)
 
 
+@cache
+def in_even_light(seed: int) -> tuple[Transform, GrayImage]:
+    """Return the pose of a marker, and its image."""
+    pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * seed))
+    return pose, render(CAMERA, {3: pose}, rays=3)
+
+
 @pytest.mark.parametrize('kind, least', [('shadow', 7), ('reflex', 9), ('spot', 9)])
 def test_a_thorough_search_reads_a_marker_in_uneven_light(kind: str, least: int) -> None:
     found = []
     for seed in range(10):
-        pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * seed))
-        image = in_uneven_light(render(CAMERA, {3: pose}), pose, seed, kind)
+        pose, even = in_even_light(seed)
+        image = in_uneven_light(even, pose, seed, kind)
         detections = search.everywhere(image, DICTIONARY, LEADER.markers)
         found.append(detections.ids.tolist() == [3] and np.abs(
             detections.corners[0] - corners_of(CAMERA, pose)).max() < 3.0)
