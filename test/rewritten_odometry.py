@@ -112,8 +112,12 @@ def rewrite(source: Source, seed: int = 0) -> Callable[[Any, float], Any]:
 
 
 def rewritten_bag(result: Path, source: Source, image_offset: float = 0.0,
-                  image_jitter: float = 0.0) -> Path:
-    """Write the sample with the odometry of a source, and its images' stamps off by so many s."""
+                  image_jitter: float = 0.0, seconds: float = 60.0) -> Path:
+    """
+    Write the sample with the odometry of a source, and its images' stamps off by so many s.
+
+    Of its 12 s no more than so many seconds are written.
+    """
     rng, alter, count = np.random.default_rng(1), rewrite(source), itertools.count(1)
 
     def odom(fields: Any) -> None:
@@ -131,7 +135,7 @@ def rewritten_bag(result: Path, source: Source, image_offset: float = 0.0,
                 stamp_ns=message.stamp_ns + round(source.late * 1e9))
         moved = message.topic.startswith('/image') and (image_offset or image_jitter)
         return edited(message, late) if moved else message
-    return excerpt(result, 60.0, change)
+    return excerpt(result, seconds, change)
 
 
 def sources() -> Iterator[tuple[str, Source]]:

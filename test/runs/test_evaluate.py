@@ -89,13 +89,13 @@ def with_ranges(path: Path, seen: float, seconds: float) -> Path:
 
 @pytest.mark.usefixtures('undrawn')
 def test_ranges_in_a_bag_are_used_where_the_neighbor_is_not_in_sight(tmp_path: Path) -> None:
-    bag_path = with_ranges(tmp_path / 'bag', 3.0, 7.0)
+    bag_path = with_ranges(tmp_path / 'bag', 1.5, 4.0)
     assert main([str(bag_path), '--output', str(tmp_path / 'out')]) == 0
     with open_bag(bag_path) as bag, open_bag(tmp_path / 'out' / 'result.mcap') as result:
         times = np.array([(m.stamp_ns - bag.start_ns) * 1e-9
                           for m in result.messages(['/neighbors'])])
-    assert np.sum((times > 3.1) & (times < 3.4)) == 0  # images cease at 3 s
-    assert np.sum(times > 3.4) > 80  # of 105
+    assert np.sum((times > 1.6) & (times < 1.9)) == 0  # images cease at 1.5 s
+    assert np.sum(times > 1.9) > 45  # of 60
 
 
 def test_the_summary_has_the_figures_others_rely_on(result: Path) -> None:
@@ -171,7 +171,8 @@ def test_errors_of_check_fail_the_run_and_stand_before_the_figures(
     pytest.param(0.6, 3600, True, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s',
                  marks=pytest.mark.sweep),
     (0.6, 3600, False, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s'),
-    (0.6, 6, True, 'error', 'bag clock: times jump by +6.0 s after 0.6 s'),
+    pytest.param(0.6, 6, True, 'error', 'bag clock: times jump by +6.0 s after 0.6 s',
+                 marks=pytest.mark.sweep),
     # Played in the order of their times, what was recorded later comes first.
     (0.6, -3600, True, 'error', 'bag clock: times jump by +3598.8 s after 0.6 s')])
 def test_a_clock_set_in_flight_is_an_error(
