@@ -83,8 +83,9 @@ class WarpedMarker:
         finer = np.array([[_FINER, 0.0, (_FINER - 1) / 2], [0.0, _FINER, (_FINER - 1) / 2],
                           [0.0, 0.0, 1.0]])
         warp = finer @ self.camera.matrix @ plane @ self._on_marker
-        shown, cover = (cv2.resize(cv2.warpPerspective(
-            texture, warp, (_FINER * _SIZE[0], _FINER * _SIZE[1])), _SIZE,
-            interpolation=cv2.INTER_AREA) for texture in (lit, np.ones_like(lit)))
+        both = np.dstack([lit, np.ones_like(lit)]).astype(np.float32)  # and what it covers
+        shown, cover = np.moveaxis(cv2.resize(cv2.warpPerspective(
+            both, warp, (_FINER * _SIZE[0], _FINER * _SIZE[1])), _SIZE,
+            interpolation=cv2.INTER_AREA), 2, 0)
         seen: Array = shown + (1.0 - cover) * self._background
         return seen

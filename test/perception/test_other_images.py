@@ -34,7 +34,7 @@ from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.tracker import camera_mounting, Sighting
 
 pytestmark = pytest.mark.slow
-IMAGES, FIRST = 40, 5  # of a flight, and how many of them are as clear as can be
+IMAGES, FIRST = 26, 5  # of a flight, and how many of them are as clear as can be
 Show = Callable[[int, Transform, WarpedMarker], GrayImage]
 
 
@@ -101,7 +101,7 @@ def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
 
 def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) -> list[Transform]:
     """Return the poses of a marker that moves by some cells in the image while it is exposed."""
-    steps = (np.arange(int(8 * cells) + 1) + 0.5) / (int(8 * cells) + 1) - 0.5
+    steps = (np.arange(int(6 * cells) + 1) + 0.5) / (int(6 * cells) + 1) - 0.5
     path = cells * world.cell * np.array([np.cos(direction), np.sin(direction), 0.0])
     return [Transform(pose.rotation, pose.translation + step * path) for step in steps]
 
