@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow
 DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
          'leaderless_lyapunov', 'leader_trajectories', 'leader_speeds', 'leader_distances')
 #: All are written by one function.
-WRITTEN = 'leader_trajectories'
+WRITTEN = 'leaderless_lyapunov'
 
 
 @pytest.fixture(scope='module')
