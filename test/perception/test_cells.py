@@ -159,10 +159,12 @@ def test_the_edge_of_a_shadow_does_not_hide_the_code(dictionary: str, light: flo
             assert shows_code(image, places(code), code), marker_id
 
 
+@pytest.mark.parametrize('count', [18, pytest.param(60, marks=pytest.mark.sweep)])
 @pytest.mark.parametrize('dictionary', DICTIONARIES)
-def test_no_other_marker_shows_the_code_in_even_light_or_in_shade(dictionary: str) -> None:
+def test_no_other_marker_shows_the_code_in_even_light_or_in_shade(
+        dictionary: str, count: int) -> None:
     rng, code = np.random.default_rng(13), code_of(3, dictionary)
-    for marker_id in range(min(aruco.dictionary_size(dictionary), 60)):
+    for marker_id in range(min(aruco.dictionary_size(dictionary), count)):
         for quarters in range(4):
             cells = np.rot90(aruco.marker_code(dictionary, marker_id), quarters)
             image = picture(cells, black=12)

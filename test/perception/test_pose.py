@@ -159,7 +159,7 @@ FINITE = st.floats(-5.0, 5.0)
 SHOWN = render(SMALL, {0: facing((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))})
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(st.tuples(FINITE, FINITE, FINITE), st.tuples(FINITE, FINITE, FINITE), st.booleans())
 def test_tracking_from_anywhere_neither_raises_nor_warns(
         place: tuple[float, float, float], turn: tuple[float, float, float], check: bool) -> None:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 from marker_images import CONFIG, make_camera, render, TAIL
@@ -24,6 +25,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import (
+    Array,
     rotation_vector_to_matrix,
     rotation_vector_to_quaternion,
     Transform,
@@ -36,6 +38,7 @@ from flock_follower.perception.tracker import camera_mounting, Tracker
 
 CAMERA = make_camera()
 READOUT = 0.03
+ROWS = range(160, 330)  # where the marker is
 
 
 @pytest.mark.parametrize(('height', 'share'), [
@@ -45,16 +48,21 @@ def test_a_row_lower_in_the_image_is_exposed_later(height: float, share: float) 
     assert row_delay(CAMERA, READOUT, seen) == pytest.approx(READOUT * share, abs=0.002)
 
 
+@cache
+def rays_of_rows() -> list[Array]:
+    """Return the rays (n, 3) of the pixels of each of ROWS."""
+    u = np.arange(CAMERA.width, dtype=float)
+    return [np.column_stack([CAMERA.undistort(np.column_stack([u, np.full_like(u, row)])),
+                             np.ones_like(u)]) for row in ROWS]
+
+
 def rolled(T_camera_marker_at: Callable[[float], Transform], seed: int = 0) -> GrayImage:
     """Return an image whose rows are exposed one after another, given the pose later, s."""
     middle = T_camera_marker_at(0.5 * READOUT)
     sharp = render(CAMERA, {0: middle}, rays=2, noise=0.0, seed=seed)
-    u = np.arange(CAMERA.width, dtype=float)
     source = np.full((CAMERA.height, CAMERA.width, 2), -1.0, dtype=np.float32)
-    for row in range(160, 330):  # where the marker is
+    for row, ray in zip(ROWS, rays_of_rows()):
         pose = T_camera_marker_at(READOUT * row / CAMERA.height)
-        ray = np.column_stack([CAMERA.undistort(np.column_stack([u, np.full_like(u, row)])),
-                               np.ones_like(u)])
         normal = pose.rotation[:, 2]
         hit = ray * ((normal @ pose.translation) / (ray @ normal))[:, None]
         source[row] = CAMERA.project(middle.apply(pose.inverse().apply(hit)))
@@ -64,26 +72,33 @@ def rolled(T_camera_marker_at: Callable[[float], Transform], seed: int = 0) -> G
     return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize('known', [True, False])
-def test_a_turning_drone_with_a_rolling_shutter_sees_a_leader_at_rest(known: bool) -> None:
-    """It pitches up and down at up to 0.5 rad/s; the leader and its own place are at rest."""
-    mounting = camera_mounting([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    camera = MountedCamera(mounting, readout_time=READOUT if known else 0.0)
-    tracker = Tracker(CONFIG, {'': camera})
+MOUNTING = camera_mounting([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope='module')
+def pitching() -> list[tuple[float, GrayImage]]:
+    """Return stamps and images of a leader at rest from a drone that pitches at its place."""
     leader = Transform(rotation_vector_to_matrix([0.0, 0.15, 0.3]), np.array([2.2, 0.0, 0.0]))
-    speeds, ranges = [], []
 
     def own(t: float) -> Transform:
         return Transform(rotation_vector_to_matrix([0.0, 0.06 * np.sin(8.0 * t), 0.0]))
+    return [(stamp, rolled(lambda later, stamp=stamp: (
+        own(stamp + later) @ MOUNTING).inverse() @ leader @ TAIL, k))
+        for k, stamp in enumerate(0.05 * np.arange(18))]
 
-    for k in range(18):
-        stamp = 0.05 * k
+
+@pytest.mark.parametrize('known', [True, False])
+def test_a_turning_drone_with_a_rolling_shutter_sees_a_leader_at_rest(
+        known: bool, pitching: list[tuple[float, GrayImage]]) -> None:
+    """It pitches up and down at up to 0.5 rad/s; the leader and its own place are at rest."""
+    camera = MountedCamera(MOUNTING, readout_time=READOUT if known else 0.0)
+    tracker = Tracker(CONFIG, {'': camera})
+    speeds, ranges = [], []
+    for k, (stamp, image) in enumerate(pitching):
         for t in np.arange(stamp - 0.05, stamp + 0.045, 0.005):
             tracker.feed_odometry(OdometrySample(
                 t, np.zeros(3), rotation_vector_to_quaternion([0.0, 0.06 * np.sin(8.0 * t), 0.0]),
                 np.zeros(3), np.array([0.0, 0.48 * np.cos(8.0 * t), 0.0])))
-        image = rolled(lambda later, stamp=stamp: (
-            own(stamp + later) @ mounting).inverse() @ leader @ TAIL, k)
         estimate = tracker.process_image(stamp, image, CAMERA).estimates['leader']
         if k >= 6:
             speeds.append(np.linalg.norm(estimate.velocity))
