@@ -270,7 +270,7 @@ def usable(motion):
 
 
 @pytest.mark.slow
-@settings(max_examples=250)
+@settings(max_examples=150)
 @given(LIMIT_SETS, BOTH_MOTIONS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments):
     setpoint, again, still = (

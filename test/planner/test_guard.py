@@ -67,7 +67,7 @@ def situation(seed: int, count: int) -> tuple[Array, Array, list[Bound]]:
     return a, v, around
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(ANYTHING, ANYTHING, st.lists(st.tuples(ANYTHING, ANYTHING, ANYTHING), max_size=3),
        st.floats(0.01, 100.0), st.floats(0.01, 100.0), st.floats(0.01, 1.0))
 @pytest.mark.filterwarnings('ignore:overflow')

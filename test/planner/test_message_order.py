@@ -120,7 +120,7 @@ def flown(params: PlannerParams, rounds: Sequence[Round], shuffle: np.random.Gen
     return found
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(SEEDS, st.booleans())
 def test_the_order_of_estimates_changes_no_bit(seed: int, relative: bool) -> None:
     rng = np.random.default_rng(seed)

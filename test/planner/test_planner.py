@@ -412,7 +412,7 @@ def draw_state(rng: np.random.Generator, now: float) -> tuple[float, Array, Arra
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2 ** 32), st.integers(1, 8), st.sampled_from(ALTITUDE_MODES))
 @pytest.mark.filterwarnings('ignore:overflow')
 def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, count: int,
