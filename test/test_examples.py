@@ -20,6 +20,7 @@ import json
 import os
 from pathlib import Path
 import runpy
+import signal
 import subprocess
 import sys
 
@@ -27,32 +28,49 @@ from bag_excerpts import excerpt
 import pytest
 import yaml
 
+from flock_desk.closed_loop import campaign
+from flock_desk.closed_loop.metrics import Flights
 from flock_desk.runs.processes import private_environment, Processes
+from flock_desk.scenarios.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / 'examples'
 pytestmark = pytest.mark.ros
 
 
-def run(name: str, *arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(EXAMPLES / name), *map(str, arguments)], cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60.0)
+def run_here(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run a page in this process, in a folder; return its exit code."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, 'argv', [name, *arguments])
+    monkeypatch.setattr(signal, 'signal', lambda *_: None)  # Ctrl-C stays that of the tests
+    try:
+        runpy.run_path(str(EXAMPLES / name), run_name='__main__')
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
 
 
-def test_the_law_alone_draws_a_flock_that_agrees(tmp_path: Path) -> None:
-    ended = run('law_alone.py', folder=tmp_path)
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stdout.startswith('speeds [0.1075 0.1075 0.1075] m/s')  # as the paper's
+def test_the_law_alone_draws_a_flock_that_agrees(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_here('law_alone.py', tmp_path, monkeypatch) == 0
+    assert capsys.readouterr().out.startswith('speeds [0.1075 0.1075 0.1075] m/s')  # the paper's
     assert (tmp_path / 'build' / 'law_alone.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_scenario_is_flown_and_reported(tmp_path: Path) -> None:
-    ended = run('scenario_report.py', 'out', folder=tmp_path)
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stdout.splitlines()[-1] == 'report: out/report.html'
+def test_a_scenario_is_flown_and_reported(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    fly = campaign.fly
+
+    def fly_two(scenario: Scenario, runs: range, guard: bool) -> Flights:
+        assert runs == range(10)
+        return fly(scenario, runs[:2], guard)
+    monkeypatch.setattr(campaign, 'fly', fly_two)
+    assert run_here('scenario_report.py', tmp_path, monkeypatch, 'out') == 0
+    assert capsys.readouterr().out.splitlines()[-1] == 'report: out/report.html'
     figures = json.loads((tmp_path / 'out' / 'summary.json').read_text())
-    assert figures['runs'] == 10 and figures['in_band'] == 1.0
+    assert figures['runs'] == 2 and figures['in_band'] == 1.0
     page = (tmp_path / 'out' / 'report.html').read_text()
     assert 'hides for a second' in page and 'src="data:image/png' in page
 
