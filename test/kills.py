@@ -152,7 +152,7 @@ def braking_times(kills: int, seed: int, folder: Path) -> Iterator[tuple[str, fl
     """Yield the victim and the time to braking, s, of each of some kills, victims taking turns."""
     chance = random.Random(seed)
     bag = folder / 'bag'
-    write_bag(bag, 40.0)
+    write_bag(bag, 25.0)
     for k in range(kills):
         victim = VICTIMS[k % len(VICTIMS)]
         yield victim, braking_time(victim, chance.uniform(0.3, 1.3), bag, folder / str(k))

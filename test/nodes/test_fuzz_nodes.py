@@ -20,20 +20,21 @@ import pytest
 
 # Overflows and NaN in the middle of a calculation are no errors if its result is discarded.
 pytestmark = [pytest.mark.filterwarnings('ignore::RuntimeWarning'), pytest.mark.usefixtures('ros')]
-COUNT = 2000
+COUNT = {'mavlink_bridge': 2000}  # else 1000
 #: What shows that the messages reached the depths of a node, by what it published.
-REACHED = {'planner': {'MultiDOFJointTrajectory': 200}, 'mavlink_bridge': {},
+REACHED = {'planner': {'MultiDOFJointTrajectory': 100}, 'mavlink_bridge': {},
            'relative_pose': {'Odometry': 5}, 'relative_pose compressed': {'Odometry': 5},
-           'sharing': {'Odometry': 50}}
+           'sharing': {'Odometry': 25}}
 
 
 @pytest.mark.parametrize('kind', NODES)
 def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
-    under_fire = fuzz_node(kind, COUNT, 1)
+    count = COUNT.get(kind, 1000)
+    under_fire = fuzz_node(kind, count, 1)
     for name, least in REACHED[kind].items():
         assert under_fire.published[name] >= least
     counters = under_fire.node.diagnostics.counters
-    assert sum(counters.values()) > COUNT // 10
+    assert sum(counters.values()) > count // 10
     if kind == 'mavlink_bridge':
         assert min(under_fire.sent[kind] for kind in (
             'SET_POSITION_TARGET_LOCAL_NED', 'ODOMETRY')) > 10
@@ -41,7 +42,7 @@ def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
         for seed in range(2, 6):  # a vehicle that is starved of time leaves the mode early
             if min(counters[why] for why in wrong) > 0:
                 break
-            counters += fuzz_node(kind, COUNT, seed).node.diagnostics.counters
+            counters += fuzz_node(kind, count, seed).node.diagnostics.counters
         assert min(counters[why] for why in wrong) > 0  # they reached the gate
 
 

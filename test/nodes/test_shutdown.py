@@ -31,7 +31,7 @@ from flock_desk.runs.processes import (
 )
 from flock_follower.files import resource
 
-MOMENTS = (0.3, 1.2, 2.5)  # s: during the imports, at the start, and in flight
+MOMENTS = (0.8, 2.5)  # s: during the imports or at the start, and in flight
 WRITER = """
 import os
 from flock_follower.nodes.support.output import never_block_output

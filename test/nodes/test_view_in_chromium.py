@@ -43,7 +43,7 @@ from std_srvs.srv import SetBool, Trigger
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STILL = (0.0, 0.0, 0.0)
 EVIL = '<img src=x onerror="document.title=1">'

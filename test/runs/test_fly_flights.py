@@ -34,10 +34,10 @@ AUTOPILOT = str(Path(__file__).parents[1] / 'faulty_autopilot.py')
 
 
 def test_a_flight_is_safe_and_its_report_complete(tmp_path):
-    main(['--scenario', 'hover', '--duration', '4', '--output', str(tmp_path)])
+    main(['--scenario', 'hover', '--duration', '3', '--output', str(tmp_path)])
     summary = json.loads((tmp_path / 'summary.json').read_text())
     # Whatever else this machine is doing: nothing unsafe is sent or flown, and it follows.
-    assert summary['duration_s'] == pytest.approx(4.0, abs=0.02)
+    assert summary['duration_s'] == pytest.approx(3.0, abs=0.02)
     assert summary['time_in_band_share'] == 1.0
     assert summary['setpoints']['acceleration_max_m_s2'] <= 2.5
     assert summary['speed_max_m_s'] <= 0.55
@@ -79,15 +79,18 @@ def test_a_flight_from_the_ground_and_back(running, tmp_path):
     autopilot = running(
         '--start', 'landed', '--yaw', '60', '--connect', f'127.0.0.1:{port}',
         '--truth', f'127.0.0.1:{truth}', '--log', str(log), '--param', 'COM_OF_LOSS_T=0.5',
-        '--param', 'EKF2_EV_CTRL=15', '--param', 'EKF2_GPS_CTRL=0')
-    main(['--scenario', 'hover', '--duration', '4', '--output', str(out),
+        '--param', 'EKF2_EV_CTRL=15', '--param', 'EKF2_GPS_CTRL=0',
+        # Sooner up and down than by default.
+        '--param', 'MPC_TKO_RAMP_T=0.5', '--param', 'MPC_LAND_SPEED=1.4',
+        '--param', 'COM_DISARM_LAND=0.5')
+    main(['--scenario', 'hover', '--duration', '3', '--output', str(out),
           '--autopilot', f'udp:127.0.0.1:{port}', '--truth', f'udpin:127.0.0.1:{truth}',
           '--forward-odometry'])
     # Whatever else this machine is doing: it followed safely, and the report is there.
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['external']['pose_from'] == 'HIL_STATE_QUATERNION'
     assert summary['external']['pace'] == pytest.approx(1.0, abs=0.2)
-    assert summary['duration_s'] == pytest.approx(4.0, abs=0.05)
+    assert summary['duration_s'] == pytest.approx(3.0, abs=0.05)
     assert summary['true_distance_m']['min'] > 1.0 and summary['true_distance_m']['max'] < 2.83
     assert summary['distance_rms_m'] < 0.02 and summary['speed_max_m_s'] <= 0.55
     assert summary['frames'] * summary['recall'] > 20 and summary['failed_processes'] == 0
