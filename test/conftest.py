@@ -54,6 +54,8 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = private_environment()['ROS_DOMAIN_ID']
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 os.environ['VIEW'] = 'no'  # flights start no live page
+# As the nodes do: there is a core for each worker.
+os.environ.setdefault('OPENCV_FOR_THREADS_NUM', '1')
 # Nodes find each other in a fifth of a second instead of up to 2.5 s.
 os.environ.update(profile_variables('config/dds/fastdds.xml'))
 
@@ -63,7 +65,7 @@ FAST = 'unit or linter'
 NODES = 'flock_follower.nodes', 'flock_desk.simulator_', 'flock_desk.recorder_node'
 
 settings.register_profile(
-    'repeatable', derandomize=True, deadline=None, print_blob=False,
+    'repeatable', derandomize=True, deadline=None, print_blob=False, max_examples=60,
     suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile('repeatable')
 
@@ -176,7 +178,8 @@ class Progress:
             self.failed[report.nodeid] = True
             if load := dict(report.user_properties).get('too busy'):
                 self.busy[report.nodeid] = load
-        self.write()
+        if report.when == 'teardown' or report.failed:
+            self.write()
 
     def write(self):
         """Write the status, whole."""
@@ -196,7 +199,8 @@ def pytest_configure(config):
     """Choose the tests; measure the load, where they run; count them, where they are reported."""
     if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.option.markexpr:
         config.option.markexpr = FAST
-    threading.Thread(target=measure_load, daemon=True).start()
+    if not getattr(config.option, 'numprocesses', None):  # else its workers do
+        threading.Thread(target=measure_load, daemon=True).start()
     if not hasattr(config, 'workerinput'):
         config.pluginmanager.register(Progress(os.environ.pop('FLOCK_FOLLOWER_TEST_STATUS', '')))
 
