@@ -102,7 +102,7 @@ test: setup
 	@$(RUN) test/suite.py $(filter-out test,$(TESTS)) $(if $(MARKERS),-m '$(MARKERS)')
 
 test-slow: setup
-	@$(RUN) $(PYTEST) -m sweep
+	@$(RUN) $(PYTEST) -n 2 -m sweep
 
 test-unit: setup
 	@$(RUN) -m pytest -m unit
