@@ -217,7 +217,7 @@ class MavlinkBridge(FlockNode):
             topic = self.resolve_topic_name('command/trajectory')
             who = f'{listed(publishers(self, topic))} on {topic}'
             gate = self._bridge.gate
-            self._stream.submit(lambda: gate.permit(gate.permission.contested(who)))
+            self._stream.submit(lambda: gate.permit(gate.permission.contest(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
