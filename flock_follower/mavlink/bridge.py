@@ -47,13 +47,14 @@ from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
 from flock_follower.mavlink.sticks import KINDS, StickWatch
-from flock_follower.mavlink.takeover import AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
+from flock_follower.mavlink.takeover import EVIDENCE_AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.ranges import first_reason
 
-#: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
+#: At the end of the bridge braking ends below this speed, m/s.
 REST_SPEED: Final[float] = 0.1
+#: It ends after this time at the latest, s.
 STOP_TIMEOUT: Final[float] = 1.0
 #: Action if the bridge stops its stream without a valid velocity. Silence alone leaves ArduPilot
 #: in GUIDED, and PX4's failsafe first holds for 4 s on the invalid estimate.
@@ -378,16 +379,17 @@ class Bridge:
         self._attribute_takeover(now)
 
     def _attribute_takeover(self, now: float) -> None:
-        """Find out who has taken over; report it once it is known, or after AFTER."""
+        """Find out who has taken over; report it once it is known, or after EVIDENCE_AFTER."""
         permission, dialect = self.gate.permission, self.telemetry.dialect
         if permission.phase is not Phase.TAKEN_OVER or permission.taker in (PILOT, STICK) or (
                 dialect is None):
             return
         taker = self.takeover.taker(dialect, permission.received)
-        if now - permission.received > AFTER and taker != PILOT:
+        if now - permission.received > EVIDENCE_AFTER and taker != PILOT:
             taker = permission.taker  # later evidence belongs to another failsafe
         self.gate.permit(permission.name_taker(taker, now))
-        settled = taker not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
+        settled = taker not in (UNKNOWN, failsafe(UNNAMED)) or (
+            now - permission.received > EVIDENCE_AFTER)
         if settled and taker != self._reported_taker:
             self._reported_taker = taker
             self.ground_station.take_handover(taker.text)
