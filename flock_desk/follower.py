@@ -198,7 +198,7 @@ class Follower:
     def permit(self, time: int, since: float) -> None:
         """Take a request for offboard; HEARTBEATs after the time ``since``, s, answer it."""
         self.advance(time)
-        self._control.permit(self._control.permission.requested(since))
+        self._control.permit(self._control.permission.request(since))
         self._announce_bridge_state()
 
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
@@ -232,7 +232,7 @@ class Follower:
         """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
         self.advance(time)
         self._control.take_height(altitude, self._seconds())
-        if not self._control.heights.referenced:
+        if not self._control.heights.has_reference:
             self._control.heights.refer(height, self._seconds())
 
     def bridge_died(self, time: int) -> None:
@@ -492,7 +492,7 @@ class Follower:
 
     def _announce_bridge_state(self) -> None:
         """Pass a new announcement of the bridge to the planner."""
-        text = self._control.permission.announced()
+        text = self._control.permission.announcement()
         if text != self._bridge_state and self._bridge_ended is None:
             self._bridge_state = text
             self.planner.take_bridge_state(text, 0.0)

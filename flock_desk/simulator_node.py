@@ -65,7 +65,7 @@ from flock_follower.bags.live_line import LiveLine
 from flock_follower.bridge_state import ACTIVE, NO_AUTOPILOT
 from flock_follower.checks.processor import children, LoadMeter
 from flock_follower.geometry import Array, quaternion_to_matrix
-from flock_follower.mavlink.link import IDS
+from flock_follower.mavlink.link import ID_RANGE
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.runtime import FlockNode
@@ -96,7 +96,7 @@ SPECS = [
          "link on which an external autopilot reports the true place of its vehicle; not the "
          "bridge's link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; "
          "PX4's SIH: the default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
-    Spec('target_system', 1, 'MAVLink system id of the autopilot', IDS),
+    Spec('target_system', 1, 'MAVLink system id of the autopilot', ID_RANGE),
     Spec('require_truth', False,
          'refuse the estimate of an external autopilot that sends no ground truth: set it if odom '
          'is forwarded to it'),
@@ -104,7 +104,7 @@ SPECS = [
          'link on which the autopilot of the leader, a second vehicle, reports its true place '
          "(vehicle = external); empty: the leader of the scenario. PX4's second SIH: "
          "udpin:127.0.0.1:19411, ArduPilot's second SITL: tcp:127.0.0.1:5772"),
-    Spec('leader_target_system', 2, "MAVLink system id of the leader's autopilot", IDS),
+    Spec('leader_target_system', 2, "MAVLink system id of the leader's autopilot", ID_RANGE),
     Spec('leader_topic', '',
          'topic with the true motion of the leader from another simulator (nav_msgs/Odometry, its '
          'truth/motion; vehicle = embedded); empty: the leader of the scenario'),

@@ -131,7 +131,7 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
                 np.array([0.1, 0.2, 0.3]), np.eye(6), np.eye(6), np.eye(3)), now, now)
         match k % 100:
             case 0 | 25 | 50 | 75:
-                bridge.gate.permit(bridge.gate.permission.requested(now))
+                bridge.gate.permit(bridge.gate.permission.request(now))
             case 30:
                 bridge.requests.arm(True, now)
             case 60:

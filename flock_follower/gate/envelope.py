@@ -47,9 +47,10 @@ from flock_follower.ranges import (
     V_MAX,
 )
 
-#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s:
-#: the healthy estimate of PX4 1.16 (SIH, odometry forwarded) errs by up to 0.25, averaged.
+#: Where no limit is set, velocities disagree that differ by this share of v_max.
 DISAGREEMENT_SHARE: Final[float] = 0.5
+#: They differ by this at least, m/s: the healthy estimate of PX4 1.16 (SIH, odometry forwarded)
+#: errs by up to 0.25, averaged.
 DISAGREEMENT_LEAST: Final[float] = 0.4
 
 
@@ -121,8 +122,9 @@ class GateLimits(Checked):
 BRAKING_SHARE: Final[float] = 0.4
 #: Time from a decision to the commanded acceleration, s: attitude, sending, velocity.
 REACTION_TIME: Final[float] = 0.4
-#: Time constant and largest speed of the return from beyond a bound of the envelope, s and m/s.
+#: Time constant of the return from beyond a bound of the envelope, s.
 ENVELOPE_RETURN_TIME: Final[float] = 1.0
+#: Largest speed of that return, m/s.
 ENVELOPE_RETURN_SPEED: Final[float] = 0.3
 #: Beyond a bound by more than this, m, the vehicle is handed over: 5 sigma of the height.
 TOLERANCE: Final[float] = 0.15
@@ -184,14 +186,14 @@ def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float)
         return None
     distance = math.hypot(*place.offset.tolist())
     if not 0.5 * limits.radius_max < distance < math.inf:
-        return None  # at the centre no direction is outwards
+        return None  # at the center no direction is outwards
     outward = complex(*place.offset.tolist()) / distance
     speed = approach_speed(limits.radius_max - distance, BRAKING_SHARE * limits.a_max)
     closing = product(outward, complex(float(velocity[0]), float(velocity[1])))
     return -outward, (closing - speed) / horizon
 
 
-def exceeded(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) -> str:
+def find_exceeded_bound(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) -> str:
     """Return the bound that the vehicle exceeds by more than a tolerance, m, as text, or ''."""
     height = limits.height_min if place.height is None else place.height
     distance = 0.0 if place.offset is None else math.hypot(*place.offset.tolist())
@@ -205,13 +207,13 @@ def exceeded(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) 
          f'{limits.radius_max:g} m'))
 
 
-def outside(limits: GateLimits, height: float | None) -> str:
+def refuse_height(limits: GateLimits, height: float | None) -> str:
     """Return why a vehicle of a height, m, may not fly our setpoints, or ''."""
     if height is None:
         return ('the height above the place of arming is not known: neither barometer '
                 '(SCALED_PRESSURE) nor rangefinder (DISTANCE_SENSOR), or armed before the bridge '
                 'started and no HOME_POSITION')
-    return exceeded(limits, Location(height), 0.0)
+    return find_exceeded_bound(limits, Location(height), 0.0)
 
 
 #: 1/s. White noise of 0.09 m at 20 Hz (PX4 1.16, SIH) leaves 0.02 m in the height.
@@ -221,20 +223,25 @@ SETTLING: Final[float] = 3.0
 #: m/s: a larger error of a vertical velocity is not corrected: the sensor may be the wrong one.
 MAX_CORRECTION: Final[float] = 1.0
 #: A height older than this, s, is not known any more.
-TIMEOUT: Final[float] = 1.0
-#: The sensor has jumped if its samples of STEP_TIME, s, STEP_SAMPLES at least, differ on average
-#: by more than STEP, m, from the height expected, and by more than CHANGE, m, from those of the
-#: STEP_TIME before: a climb that the other source denies grows more slowly. Of a jump of 0.3 m the
-#: observer follows a sixth meanwhile.
+HEIGHT_TIMEOUT: Final[float] = 1.0
+#: The sensor has jumped if its newest samples differ on average by more than this from the height
+#: expected, m.
 STEP: Final[float] = 0.25
-CHANGE: Final[float] = 0.2
+#: They differ by more than this from the samples before, too, m: a climb that the other source
+#: denies grows more slowly.
+STEP_CHANGE: Final[float] = 0.2
+#: Newest samples are those of this time, s. Meanwhile the observer follows a sixth of a jump of
+#: 0.3 m.
 STEP_TIME: Final[float] = 0.2
+#: Least number of newest samples.
 STEP_SAMPLES: Final[int] = 3
 #: For this long, s, after a jump the vehicle brakes.
 STEP_PAUSE: Final[float] = 1.0
-#: The standard atmosphere (ISO 2533): pressure at sea level, hPa, scale height, m, and exponent.
+#: Pressure of the standard atmosphere (ISO 2533) at sea level, hPa.
 SEA_LEVEL_PRESSURE: Final[float] = 1013.25
-_SCALE: Final[float] = 44330.77
+#: Altitude at which the formula of that atmosphere has no pressure, m.
+_ZERO_PRESSURE_ALTITUDE: Final[float] = 44330.77
+#: Exponent of the pressure in that formula.
 _EXPONENT: Final[float] = 0.190263
 
 
@@ -242,7 +249,7 @@ def pressure_altitude(pressure: float) -> float:
     """Return the altitude, m, at which the standard atmosphere has a pressure, hPa; or NaN."""
     if not 0.0 < pressure < 2000.0:
         return math.nan
-    return _SCALE * (1.0 - (pressure / SEA_LEVEL_PRESSURE) ** _EXPONENT)
+    return _ZERO_PRESSURE_ALTITUDE * (1.0 - (pressure / SEA_LEVEL_PRESSURE) ** _EXPONENT)
 
 
 class HeightEstimator:
@@ -282,7 +289,7 @@ class HeightEstimator:
             if before is None:
                 self._reference = None
         altitude -= self._zero
-        if elapsed > TIMEOUT:
+        if elapsed > HEIGHT_TIMEOUT:
             # A sensor that returns is used again, with the same reference.
             self._altitude, self._velocity_error, self._began = altitude, 0.0, now
             self._differences.clear()
@@ -302,7 +309,7 @@ class HeightEstimator:
         self._differences.append((now, difference))
         while now - self._differences[0][0] > 2.0 * STEP_TIME:
             self._differences.popleft()
-        if climb_rate is not None and self._jumped(now):
+        if climb_rate is not None and self._has_jumped(now):
             self.stepped = now
             self._differences.clear()
             self._altitude = expected + difference
@@ -313,28 +320,28 @@ class HeightEstimator:
         self._altitude = expected + share * difference
         self._velocity_error += BANDWIDTH ** 2 * elapsed * difference
 
-    def _jumped(self, now: float) -> bool:
+    def _has_jumped(self, now: float) -> bool:
         new = [d for time, d in self._differences if now - time <= STEP_TIME]
         old = [d for time, d in self._differences if now - time > STEP_TIME]
         if len(new) < STEP_SAMPLES or not old:
             return False
         mean = math.fsum(new) / len(new)
-        return abs(mean) > STEP and abs(mean - math.fsum(old) / len(old)) > CHANGE
+        return abs(mean) > STEP and abs(mean - math.fsum(old) / len(old)) > STEP_CHANGE
 
     @property
     def climb_rate(self) -> float:
         """Return the vertical velocity of the vehicle by the sensor, m/s."""
         return (self._reported or 0.0) + self._velocity_error
 
-    def corrected(self, climb_rate: float, now: float) -> float:
+    def correct(self, climb_rate: float, now: float) -> float:
         """Return a vertical velocity by the other source, m/s, less at most MAX_CORRECTION."""
-        known = self._reported is not None and now - self._time <= TIMEOUT
+        known = self._reported is not None and now - self._time <= HEIGHT_TIMEOUT
         error = min(max(self._velocity_error, -MAX_CORRECTION), MAX_CORRECTION)
         return climb_rate + (error if known else 0.0)
 
     def altitude(self, now: float) -> float | None:
         """Return the altitude by the sensor, m, at ``now``; None if none is known."""
-        if now - self._time > TIMEOUT:
+        if now - self._time > HEIGHT_TIMEOUT:
             return None
         return self._altitude + max(now - self._time, 0.0) * self.climb_rate
 
@@ -345,7 +352,7 @@ class HeightEstimator:
         return altitude - self._reference if known else None  # type: ignore[operator]
 
     @property
-    def referenced(self) -> bool:
+    def has_reference(self) -> bool:
         """Return whether the altitude of height 0 is known."""
         return self._reference is not None
 
@@ -353,15 +360,15 @@ class HeightEstimator:
         """Take the present height, m, as known; None forgets the reference."""
         altitude = self.altitude(now)
         self._reference = None if height is None or altitude is None else altitude - height
-        self._referred = self.referenced
+        self._referred = self.has_reference
 
-    def missing(self, now: float) -> bool:
+    def is_missing(self, now: float) -> bool:
         """Return whether a height that was known is not received any more."""
         return self._referred and self.height(now) is None
 
     def obstacle(self, now: float) -> Obstacle | None:
         """Return why a height that was known cannot be used at ``now``, or None."""
-        if self.missing(now):
+        if self.is_missing(now):
             return Obstacle.HEIGHT_STALE
         jumped = self._reference is not None and now - self.stepped < STEP_PAUSE
         return Obstacle.HEIGHT_JUMPED if jumped else None

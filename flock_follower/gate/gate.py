@@ -142,7 +142,7 @@ class Gate:
         self._height_watch = HeightWatch()
 
     def permit(self, after: Permission) -> None:
-        """Take the permission after an event, such as ``permission.requested(now)``."""
+        """Take the permission after an event, such as ``permission.request(now)``."""
         before, self.permission, phase = self.permission, after, after.phase
         self._flight.was_active = phase is Phase.ACTIVE or (
             self._flight.was_active and phase is Phase.GIVING_BACK)
@@ -157,7 +157,7 @@ class Gate:
         :param airborne: whether the autopilot reports that it flies; None if it does not report.
         """
         self._flight.status, self._flight.airborne = status, airborne
-        self.permit(self.permission.seen(status, received, airborne))
+        self.permit(self.permission.follow_status(status, received, airborne))
 
     @property
     def flies(self) -> bool:
@@ -221,7 +221,7 @@ class Gate:
     def corrected_climb_rate(self, climb_rate: float, now: float) -> float:
         """Return a vertical velocity of odom, m/s, less the error that the barometer shows."""
         by_odom = self.motion.source == ODOM
-        return self.heights.corrected(climb_rate, now) if by_odom else climb_rate
+        return self.heights.correct(climb_rate, now) if by_odom else climb_rate
 
     def take_attitude(self, quaternion: Array, rates: Array, time: float,
                       now: float) -> OdometryState | None:
@@ -284,7 +284,7 @@ class Gate:
         return first_reason(
             (displaced, str(self.motion.displaced)),
             (heightless, 'no height from the autopilot'),
-        ) or envelope.exceeded(self.limits, self.place(now)) or (
+        ) or envelope.find_exceeded_bound(self.limits, self.place(now)) or (
             self._height_watch.reason) or self.thrust_error(now, disturbance.THRUST_HANDOVER_TIME)
 
     def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = '',
@@ -301,7 +301,7 @@ class Gate:
         :param mode_age: time since a message last had the mode, s.
         """
         self.commands.is_new = False
-        self.permit(self.permission.unseen(mode_age))
+        self.permit(self.permission.follow_silence(mode_age))
         flight = self._flight
         self._notice_landing(now)
         # In flight only a lasting landed report counts: a false one must not remove thrust.
@@ -313,7 +313,7 @@ class Gate:
         engaged = flight.is_armed and flight.status is not None and (
             flight.status.offboard) and not withheld
         # While nothing is received the height is missing, too, without a fault of its sensor.
-        heightless = link_age <= self.limits.link_timeout and self.heights.missing(now)
+        heightless = link_age <= self.limits.link_timeout and self.heights.is_missing(now)
         flight.heightless_since = onset(flight.heightless_since, heightless, now)
         situation = self._observe(report, withheld, engaged, bool(distrusted), now)
         setpoint = setpoint_rules.decide(situation)
@@ -354,7 +354,7 @@ class Gate:
         self._height_watch.step(situation.place.height, self._commanded_height(
             setpoint, situation, now) if active and engaged else None)
         if not sends and not situation.withheld and situation.known.blind:
-            self.permit(self.permission.blinded(setpoint.reason))
+            self.permit(self.permission.fall_silent(setpoint.reason))
         if flown.commanded:
             flown.held, flown.yaw = None, setpoint.yaw
 
@@ -365,7 +365,7 @@ class Gate:
             down = height is None or height < LANDED_HEIGHT
         self._flight.landed_since = onset(self._flight.landed_since, down, now)
         if now - self._flight.landed_since >= LANDED_TIME:
-            self.permit(self.permission.landed())
+            self.permit(self.permission.land())
 
     def _commanded_height(self, setpoint: Setpoint, situation: Situation,
                           now: float) -> float | None:

@@ -34,10 +34,10 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     in their order, within bounds of the plane.
     """
     fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
-    strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()
-    side = Discs(0j, strongest, complex(centre[2], math.hypot(*centre[:2])), reach)
+    strongest, reach, center = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()
+    side = Discs(0j, strongest, complex(center[2], math.hypot(*center[:2])), reach)
     up = min(max(up, side.best(-1 + 0j, far=True).real), side.best(1 + 0j, far=True).real)
-    level = Discs(0j, math.sqrt(max(strongest ** 2 - up ** 2, 0.0)), complex(*centre[:2]),
-                  math.sqrt(max(reach ** 2 - (up - centre[2]) ** 2, 0.0)))
+    level = Discs(0j, math.sqrt(max(strongest ** 2 - up ** 2, 0.0)), complex(*center[:2]),
+                  math.sqrt(max(reach ** 2 - (up - center[2]) ** 2, 0.0)))
     point = lexicographic(complex(*a[:2].tolist()), sides, level)
     return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration

@@ -31,8 +31,8 @@ from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.obstacle import Obstacle, Refusal
 from flock_follower.gate.velocity_check import (
     AUTOPILOT,
-    displaced,
     DISPLACED_HANDOVER_TIME,
+    find_displacement,
     finite_vector,
     known_motion,
     KnownMotion,
@@ -152,7 +152,7 @@ class MotionSources:
         self._comparison.take(known.difference, limits.velocity_tolerance, engaged, now)
         # An estimate that rests on our odometry, or on no sensor, is no evidence.
         proves = not fused and not distrusted
-        self.displaced = None if known.source != ODOM else displaced(
+        self.displaced = None if known.source != ODOM else find_displacement(
             self._sources[ODOM], self._sources[AUTOPILOT] if proves else None,
             known.turned or 0.0, self._height_path, now)
         self._displaced_since = onset(

@@ -140,24 +140,24 @@ class Permission:
         return (f'{who} took over {max(now - self.received, 0.0):.0f} s ago: refused for '
                 f'{TAKEOVER_TIME:g} s; hold and land stay available')
 
-    def announced(self) -> str:
+    def announcement(self) -> str:
         """Return the text of ``mavlink_bridge/state`` while the autopilot is connected."""
         return ': '.join(filter(None, [self.phase.value, self.reason]))
 
     # The permission after an event.
 
-    def requested(self, time: float) -> Permission:
+    def request(self, time: float) -> Permission:
         """Permit setpoints for a request of offboard at a time, s."""
         return self if self.phase is Phase.ACTIVE else Permission(
             Phase.READY, 'waiting for offboard mode', time, cause=Cause.WAITING)
 
-    def failed(self, why: str) -> Permission:
+    def fail(self, why: str) -> Permission:
         """End a request that the vehicle refused, or did not execute in time."""
         # A mode that is reached late has no effect then.
         ends = self.phase is Phase.READY and not self.obeyed
         return Permission(reason=why, cause=Cause.FAILED) if ends else self
 
-    def ended(self, why: str, cause: Cause = Cause.ENDED) -> Permission:
+    def end(self, why: str, cause: Cause = Cause.ENDED) -> Permission:
         """Brake after a request for hold, land, disarm or the end of the bridge."""
         if self.phase is Phase.READY and not self.obeyed:
             return Permission(reason=why, cause=cause)
@@ -166,46 +166,47 @@ class Permission:
     def _giving_back(self, why: str, cause: Cause) -> Permission:
         return replace(self, phase=Phase.GIVING_BACK, reason=why, cause=cause)
 
-    def contested(self, who: str) -> Permission:
+    def contest(self, who: str) -> Permission:
         """Brake, because two nodes give commands at once."""
         return self if self.phase is not Phase.ACTIVE else self._giving_back(
             f'two nodes command: {who}', Cause.CONTESTED)
 
-    def blinded(self, why: str) -> Permission:
+    def fall_silent(self, why: str) -> Permission:
         """Fall silent without a valid velocity: only silence starts the failsafe."""
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
         return Permission(
             reason=f'fell silent: {why}', cause=Cause.SILENT) if self.streams else self
 
-    def unseen(self, silence: float) -> Permission:
+    def follow_silence(self, silence: float) -> Permission:
         """Brake for good after a time, s, without the mode: the pilot may have taken over."""
         flown = self.phase in (Phase.READY, Phase.ACTIVE) and self.obeyed
         return self if not flown or silence <= LONGEST_SILENCE else self._giving_back(
             f'mode unknown for {silence:.0f} s, the pilot may have taken over',
             Cause.MODE_UNKNOWN)
 
-    def landed(self) -> Permission:
+    def land(self) -> Permission:
         """End a flight after a landing."""
         return Permission(reason=ON_GROUND, cause=Cause.LANDED) if self.streams else self
 
-    def restarted(self, why: str) -> Permission:
+    def reset(self, why: str) -> Permission:
         """Reset: the autopilot, rebooted or replaced, has not received the request."""
         return Permission(reason=why, cause=Cause.RESTARTED)
 
-    def left(self, status: VehicleStatus, taker: Taker = UNKNOWN) -> Permission:
+    def leave_mode(self, status: VehicleStatus, taker: Taker = UNKNOWN) -> Permission:
         """End a flight whose mode the pilot or the autopilot has changed."""
         return Permission(Phase.TAKEN_OVER, _left_reason(status.mode, taker),
                           received=self.received, cause=Cause.TAKEN, taker=taker,
                           left_for=status.mode)
 
-    def attributed(self, taker: Taker, now: float) -> Permission:
+    def name_taker(self, taker: Taker, now: float) -> Permission:
         """Name who took over, found at ``now``, s; the time of a pilot counts anew."""
         if self.phase is not Phase.TAKEN_OVER or taker == self.taker:
             return self
         return replace(self, reason=_left_reason(self.left_for, taker), taker=taker, received=(
             now if taker.pilot and not self.taker.pilot else self.received))
 
-    def seen(self, status: VehicleStatus, received: float, airborne: bool | None) -> Permission:
+    def follow_status(self, status: VehicleStatus, received: float,
+                      airborne: bool | None) -> Permission:
         """
         Follow a HEARTBEAT or CURRENT_MODE that was received at the time ``received``, s.
 
@@ -214,19 +215,19 @@ class Permission:
         """
         if not self.streams or received <= self.since:
             return self
-        now = replace(self.unseen(received - self.received), received=received)
+        now = replace(self.follow_silence(received - self.received), received=received)
         if now.phase is Phase.GIVING_BACK:
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
             if status.armed and now.cause is Cause.STICK:
-                return now.left(status, STICK)
+                return now.leave_mode(status, STICK)
             if status.armed and now.cause is Cause.MODE_UNKNOWN:
-                return now.left(status)
+                return now.leave_mode(status)
             return Permission(reason=f'given back ({now.reason})', cause=Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):
             return _end_on_ground(status)
         if not status.offboard:
-            return now.left(status) if now.obeyed else now
+            return now.leave_mode(status) if now.obeyed else now
         if now.phase is Phase.ACTIVE:
             return now if status.armed else _end_on_ground(status)
         if airborne is None:

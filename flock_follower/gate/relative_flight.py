@@ -45,6 +45,7 @@ LEAK: Final[float] = 5.0
 HEIGHT_BANDWIDTH: Final[float] = 0.7
 #: After a longer gap between two attitudes, s, nothing is integrated.
 LONGEST_STEP: Final[float] = 0.2
+#: A covariance (6, 6) that is not known: zeros.
 _UNKNOWN: Final[Array] = np.zeros((6, 6))
 
 

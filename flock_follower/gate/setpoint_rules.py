@@ -117,9 +117,10 @@ def decide(situation: Situation) -> Setpoint:
             return _relative(full, command, offset, place)
         assert known.velocity is not None  # else it is refused
         axis = _direction(command.separation_axis)
-        safe = _limited(situation.limits if axis is None else full,
-                        np.asarray(command.acceleration), offset, known.velocity, place, axis)
-        return Setpoint(COMMAND, '', _grounded(safe.acceleration, airborne),
+        safe = _limit_and_offset(
+            situation.limits if axis is None else full, np.asarray(command.acceleration), offset,
+            known.velocity, place, axis)
+        return Setpoint(COMMAND, '', _limit_on_ground(safe.acceleration, airborne),
                         wrap_angle(command.yaw), safe.reason)
     refusal = refusal or Refusal(Obstacle.NO_COMMAND)
     estimated = known.braking
@@ -128,7 +129,7 @@ def decide(situation: Situation) -> Setpoint:
             return _no_command(NONE, refusal, yaw)
         # Without the offset of the thrust a level vehicle sinks or climbs.
         level = _with_offset(np.zeros(3), offset * [0.0, 0.0, float(airborne)], full.a_max, None)
-        return _no_command(LEVEL, refusal, yaw, _grounded(level, airborne))
+        return _no_command(LEVEL, refusal, yaw, _limit_on_ground(level, airborne))
     retreat = np.zeros(3) if situation.retreat is None else situation.retreat
     nominal = brake(estimated.vector - limit_norm(retreat, full.v_max), full.a_max,
                     situation.limits.brake_time + estimated.margin)
@@ -138,8 +139,9 @@ def decide(situation: Situation) -> Setpoint:
         climb = frequency * (frequency * (held.height - place.height) - 2.0 * place.climb_rate)
         if math.isfinite(climb):
             nominal[2] = climb
-    safe = _limited(full, nominal, offset, estimated, place, None)
-    return _no_command(BRAKE, refusal, yaw, _grounded(safe.acceleration, airborne), safe.reason)
+    safe = _limit_and_offset(full, nominal, offset, estimated, place, None)
+    return _no_command(
+        BRAKE, refusal, yaw, _limit_on_ground(safe.acceleration, airborne), safe.reason)
 
 
 def _no_command(kind: str, refusal: Refusal, yaw: float | None,
@@ -262,8 +264,8 @@ def _direction(axis: ArrayLike | None) -> Array | None:
     return vector if unit else None
 
 
-def _limited(limits: GateLimits, nominal: Array, offset: Array, velocity: Velocity,
-             place: Location, axis: Array | None) -> LimitedCommand:
+def _limit_and_offset(limits: GateLimits, nominal: Array, offset: Array, velocity: Velocity,
+                      place: Location, axis: Array | None) -> LimitedCommand:
     """
     Return the acceleration within limits and envelope that is nearest to ``nominal``, and offset.
 
@@ -293,7 +295,7 @@ def _limited(limits: GateLimits, nominal: Array, offset: Array, velocity: Veloci
     return LimitedCommand(total, ', '.join(filter(None, reasons)))
 
 
-def _grounded(acceleration: Array, airborne: bool) -> Array:
+def _limit_on_ground(acceleration: Array, airborne: bool) -> Array:
     """Return the acceleration, on the ground without its upward part."""
     if airborne:
         return acceleration

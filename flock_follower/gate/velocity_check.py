@@ -20,9 +20,9 @@ a wrong velocity accelerates the vehicle. Three comparisons find a contradiction
 
 - yaws: whether the frames of both sources are rotated against each other;
 - velocities, averaged over AVERAGING_TIME: if they differ, neither source is known to be right;
-- displacements over the last WINDOW seconds: a small velocity error shows in time. A position jump
-  that the source's own velocity does not explain is removed, because estimators correct
-  themselves in jumps.
+- displacements over the last DISPLACEMENT_WINDOW seconds: a small velocity error shows in time.
+  A position jump that the source's own velocity does not explain is removed, because estimators
+  correct themselves in jumps.
 
 Vectors are ENU. Time is an argument; no clock is read.
 """
@@ -258,10 +258,10 @@ class VelocityComparison:
 
 
 #: Displacements are compared over this time, s.
-WINDOW: Final[float] = 5.0
+DISPLACEMENT_WINDOW: Final[float] = 5.0
 #: Displacements may differ by this, m, or by 3 standard deviations if those are more.
 TOLERANCE: Final[float] = 0.5
-#: Standard deviation of the displacement by a barometer over WINDOW, m: gusts, doors, rotors.
+#: Standard deviation of the displacement by a barometer in that time, m: gusts, doors, rotors.
 BAROMETER_STD: Final[float] = 0.3
 #: The vehicle is handed over after displacements have differed for this long, s.
 DISPLACED_HANDOVER_TIME: Final[float] = 1.0
@@ -307,7 +307,7 @@ class Path:
         self.position, self._time = shifted, now
         if not self._kept or now - self._kept[-1][0] >= SPACING:
             self._kept.append((now, shifted))
-            while len(self._kept) > 2 and now - self._kept[1][0] >= WINDOW:
+            while len(self._kept) > 2 and now - self._kept[1][0] >= DISPLACEMENT_WINDOW:
                 self._kept.popleft()
 
     @property
@@ -315,11 +315,11 @@ class Path:
         """Return the times, s, between which the path is known."""
         return (self._kept[0][0], self._kept[-1][0]) if self._kept else (math.inf, -math.inf)
 
-    def between(self, start: float, end: float) -> Array:
+    def displacement(self, start: float, end: float) -> Array:
         """Return the displacement (3,), m, from one time within the span to another."""
-        return self._at(end) - self._at(start)
+        return self._place_at(end) - self._place_at(start)
 
-    def _at(self, time: float) -> Array:
+    def _place_at(self, time: float) -> Array:
         """Return the position (3,), m, at a time, s, within the span."""
         before, place = self._kept[-1]
         if time == before:
@@ -336,20 +336,20 @@ class Path:
 
 def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     """
-    Return the displacement (3,) of ``one`` less that of ``other``, m, over the last WINDOW.
+    Return the recent displacement (3,) of ``one`` less that of ``other``, m.
 
     :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
     :returns: zeros if they do not overlap, or one of them is not recent.
     """
     (first, last), (other_first, other_last) = one.span, other.span
-    start, end = max(first, other_first, now - WINDOW), min(last, other_last)
+    start, end = max(first, other_first, now - DISPLACEMENT_WINDOW), min(last, other_last)
     if end <= start or now - end > PATH_GAP:
         return np.zeros(3)
-    moved = one.between(start, end)
+    moved = one.displacement(start, end)
     if turn != 0.0:
         cos, sin = math.cos(turn), math.sin(turn)
         moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
-    result: Array = moved - other.between(start, end)
+    result: Array = moved - other.displacement(start, end)
     return result
 
 
@@ -412,7 +412,7 @@ class Source:
         return SourceMotion(self.velocity, now - self.velocity_time, yaw, now - self.yaw()[1])
 
 
-def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
+def find_displacement(odom: Source, autopilot: Source | None, turn: float, height: Path,
               now: float) -> Refusal | None:
     """
     Return that the displacements of odometry and of another source differ, or None.
@@ -434,4 +434,4 @@ def _too_far(error: Array, std: float, other: str) -> Refusal | None:
     distance = math.sqrt(error.dot(error))
     return None if not distance > max(TOLERANCE, 3.0 * std) else Refusal(
         Obstacle.DISPLACED, f'displacements of odom and of the {other} differ by '
-        f'{distance:.1f} m in {WINDOW:g} s')
+        f'{distance:.1f} m in {DISPLACEMENT_WINDOW:g} s')

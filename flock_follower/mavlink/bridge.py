@@ -47,13 +47,14 @@ from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
 from flock_follower.mavlink.sticks import KINDS, StickWatch
-from flock_follower.mavlink.takeover import AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
+from flock_follower.mavlink.takeover import EVIDENCE_AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.ranges import first_reason
 
-#: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
+#: At the end of the bridge braking ends below this speed, m/s.
 REST_SPEED: Final[float] = 0.1
+#: It ends after this time at the latest, s.
 STOP_TIMEOUT: Final[float] = 1.0
 #: Action if the bridge stops its stream without a valid velocity. Silence alone leaves ArduPilot
 #: in GUIDED, and PX4's failsafe first holds for 4 s on the invalid estimate.
@@ -143,7 +144,7 @@ class Bridge:
     def state(self, now: float) -> str:
         """Return the text of ``mavlink_bridge/state`` at ``now``, s: the state and its reason."""
         permission = self.gate.permission
-        announced, idle = permission.announced(), permission.phase is Phase.INACTIVE
+        announced, idle = permission.announcement(), permission.phase is Phase.INACTIVE
         if idle and (unreceived := self.housekeeping.unreceived(now)):
             announced = f'{permission.phase.value}: {unreceived}'
         return first_reason(
@@ -294,9 +295,9 @@ class Bridge:
         armed_now, self._armed = status.armed and self._armed is False, status.armed
         if not status.armed:
             heights.refer(None, now)
-        elif armed_now or (not heights.referenced and flying is False):
+        elif armed_now or (not heights.has_reference and flying is False):
             heights.refer(0.0, now)
-        elif not heights.referenced and flying and (
+        elif not heights.has_reference and flying and (
                 (above := self.telemetry.height_above_home(now)) is not None):
             heights.refer(above, now)
 
@@ -338,7 +339,7 @@ class Bridge:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
-        self.gate.permit(self.gate.permission.ended('the bridge is stopping'))
+        self.gate.permit(self.gate.permission.end('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
@@ -367,7 +368,7 @@ class Bridge:
         if before != self._vehicle:
             if before[1] != self._vehicle[1] and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
-            self.gate.permit(self.gate.permission.restarted(
+            self.gate.permit(self.gate.permission.reset(
                 'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
         flew = self.gate.permission.flies
         self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.flying(now))
@@ -378,16 +379,17 @@ class Bridge:
         self._attribute_takeover(now)
 
     def _attribute_takeover(self, now: float) -> None:
-        """Find out who has taken over; report it once it is known, or after AFTER."""
+        """Find out who has taken over; report it once it is known, or after EVIDENCE_AFTER."""
         permission, dialect = self.gate.permission, self.telemetry.dialect
         if permission.phase is not Phase.TAKEN_OVER or permission.taker in (PILOT, STICK) or (
                 dialect is None):
             return
         taker = self.takeover.taker(dialect, permission.received)
-        if now - permission.received > AFTER and taker != PILOT:
+        if now - permission.received > EVIDENCE_AFTER and taker != PILOT:
             taker = permission.taker  # later evidence belongs to another failsafe
-        self.gate.permit(permission.attributed(taker, now))
-        settled = taker not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
+        self.gate.permit(permission.name_taker(taker, now))
+        settled = taker not in (UNKNOWN, failsafe(UNNAMED)) or (
+            now - permission.received > EVIDENCE_AFTER)
         if settled and taker != self._reported_taker:
             self._reported_taker = taker
             self.ground_station.take_handover(taker.text)

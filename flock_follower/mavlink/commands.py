@@ -43,8 +43,9 @@ CONFIRM_TIMEOUT: Final[float] = 3.5
 RESEND_PERIOD: Final[float] = 1.0
 #: After a refusal, wait this long for the text that explains it, s.
 REASON_WAIT: Final[float] = 0.5
-#: Delay and slowest climb of a take-off, s and m/s; ArduPilot spools up for seconds.
+#: Longest delay of a take-off, s; ArduPilot spools up for seconds.
 TAKEOFF_DELAY: Final[float] = 10.0
+#: Slowest climb of a take-off, m/s.
 SLOWEST_CLIMB: Final[float] = 0.3
 #: A request fails if its command cannot be sent within this, s.
 STREAM_TIMEOUT: Final[float] = 3.0

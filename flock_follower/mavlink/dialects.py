@@ -38,13 +38,15 @@ _TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if 
 _NOT_FUSED: Final[str] = ': it does not fuse the odometry that is forwarded to it; '
 #: Bits of PX4's EKF2_EV_CTRL: horizontal position, and velocity.
 _FUSED_BITS: Final[int] = 1 | 4
+#: Value of ArduPilot's EK3_SRC1 parameters for external navigation.
 _EXTERNAL_NAVIGATION: Final[int] = 6
-#: MAV_TYPE of the vehicles that setpoints of acceleration are for; VTOLs while they hover.
+#: MAV_TYPE of the vehicles that setpoints of acceleration are for.
 MULTICOPTERS: Final[frozenset[int]] = frozenset({
     mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER,
     mavlink.MAV_TYPE_HEXAROTOR, mavlink.MAV_TYPE_OCTOROTOR, mavlink.MAV_TYPE_TRICOPTER,
     mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR})
-VTOLS: Final[frozenset[int]] = frozenset(range(
+#: MAV_TYPE of the vehicles that take them while they hover.
+VTOL_TYPES: Final[frozenset[int]] = frozenset(range(
     mavlink.MAV_TYPE_VTOL_TILTROTOR - 2, mavlink.MAV_TYPE_VTOL_RESERVED5 + 1))
 
 
@@ -216,7 +218,7 @@ class Dialect:
 #: PX4 1.14 and later.
 PX4: Final[Dialect] = Dialect(
     name='px4', title='PX4', firmware=mavlink.MAV_AUTOPILOT_PX4,
-    vehicle_types=MULTICOPTERS | VTOLS,
+    vehicle_types=MULTICOPTERS | VTOL_TYPES,
     modes=MappingProxyType({name: main << 16 | sub << 24 for name, main, sub in (
         ('MANUAL', 1, 0), ('ALTCTL', 2, 0), ('POSCTL', 3, 0), ('ACRO', 5, 0), ('OFFBOARD', 6, 0),
         ('STABILIZED', 7, 0), ('RATTITUDE', 8, 0), ('AUTO.READY', 4, 1), ('AUTO.TAKEOFF', 4, 2),
@@ -253,7 +255,7 @@ PX4: Final[Dialect] = Dialect(
     mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, mode_rate=50.0, least_mode_rate=2.0,
     position='POSCTL', stick_speed='MAN_OVERRIDE_SPD', reports_checks=True,
     no_reason='PX4 sends the cause only to a ground station: look there, or set announce_as_gcs')
-#: ArduCopter; its behaviour was measured on 4.7.
+#: ArduCopter; its behavior was measured on 4.7.
 ARDUPILOT: Final[Dialect] = Dialect(
     name='ardupilot', title='ArduPilot', firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
     # Its mode numbers depend on the vehicle type.

@@ -120,12 +120,13 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
 
 
 #: Rates and pauses are reported over this time, s.
-RECENT: Final[float] = 5.0
-#: A rate is measured over this time, s, or over the time of ``FEWEST`` messages.
-WINDOW: Final[float] = 1.0
-FEWEST: Final[int] = 5
+REPORT_WINDOW: Final[float] = 5.0
+#: A rate is measured over this time at least, s.
+RATE_WINDOW: Final[float] = 1.0
+#: A rate is measured over the time of this many messages at least.
+MIN_MESSAGES: Final[int] = 5
 #: The id that stands for all messages.
-ANY: Final[int] = -1
+ALL_MESSAGES: Final[int] = -1
 #: A rate below this share of the requested one is too low; autopilots round intervals.
 ENOUGH: Final[float] = 0.7
 
@@ -138,28 +139,28 @@ class Arrivals:
 
     def take(self, message_id: int, now: float) -> None:
         """Take a message that came at ``now``."""
-        for times in (self._times[message_id], self._times[ANY]):
+        for times in (self._times[message_id], self._times[ALL_MESSAGES]):
             times.append(now)
-            while now - times[0] > RECENT:
+            while now - times[0] > REPORT_WINDOW:
                 times.popleft()
 
-    def recent(self, message_id: int, now: float, window: float = RECENT) -> list[float]:
-        """Return the times of a message within ``window``, s, at most ``RECENT``."""
+    def recent(self, message_id: int, now: float, window: float = REPORT_WINDOW) -> list[float]:
+        """Return the times of a message within ``window``, s, at most ``REPORT_WINDOW``."""
         # A copy: other threads read too.
         return [time for time in self._times[message_id].copy() if now - time < window]
 
     def rate(self, message_id: int, now: float) -> float:
-        """Return the rate of a message within RECENT, Hz."""
-        return len(self.recent(message_id, now)) / RECENT
+        """Return the rate of a message within REPORT_WINDOW, Hz."""
+        return len(self.recent(message_id, now)) / REPORT_WINDOW
 
     def longest_pause(self, now: float) -> float:
-        """Return the longest pause in all messages within the last RECENT, s."""
-        times = [*self.recent(ANY, now), now]
+        """Return the longest pause in all messages within the last REPORT_WINDOW, s."""
+        times = [*self.recent(ALL_MESSAGES, now), now]
         return max((later - time for time, later in pairwise(times)), default=0.0)
 
     def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
         """Return whether the rate of a message is well below the requested one, Hz."""
-        window = min(max(WINDOW, FEWEST / wanted), RECENT)
+        window = min(max(RATE_WINDOW, MIN_MESSAGES / wanted), REPORT_WINDOW)
         # One message more or less is chance.
         return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
 

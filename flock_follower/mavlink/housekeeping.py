@@ -37,7 +37,7 @@ from typing import Any, Final, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.mavlink.estimator_health import RECENT
+from flock_follower.mavlink.estimator_health import REPORT_WINDOW
 from flock_follower.mavlink.global_origin import GlobalOrigin
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.link_questions import NO_ANSWER, REASONS
@@ -48,9 +48,9 @@ from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 from flock_follower.messages import to_nanoseconds
 
 #: Time between two requests of TIMESYNC, s.
-PERIOD: Final[float] = 1.0
+TIMESYNC_PERIOD: Final[float] = 1.0
 #: The answer with the shortest delay among this many gives the offset.
-WINDOW: Final[int] = 10
+TIMESYNC_SAMPLES: Final[int] = 10
 #: Answers older than this, ns, are not used: clocks drift by up to 0.1 ms/s.
 MEMORY: Final[int] = 30_000_000_000
 #: In that time the samples of two clocks of the same speed may differ by this, ns.
@@ -74,8 +74,8 @@ class TimeSync:
     """Our side of TIMESYNC; times are integer nanoseconds of one monotonic clock."""
 
     def __init__(self) -> None:
-        self._samples: deque[Sample] = deque(maxlen=WINDOW)
-        self._asked: deque[int] = deque(maxlen=WINDOW)
+        self._samples: deque[Sample] = deque(maxlen=TIMESYNC_SAMPLES)
+        self._asked: deque[int] = deque(maxlen=TIMESYNC_SAMPLES)
 
     def request(self, now: int) -> Any:
         """Return the request for the autopilot's time."""
@@ -131,13 +131,13 @@ RATES: Final[Mapping[int, float]] = MappingProxyType({
 #: The requested rates of the pilot's sticks, Hz.
 STICK_RATES: Final[Mapping[int, float]] = MappingProxyType({
     mavlink.MAVLINK_MSG_ID_MANUAL_CONTROL: 10.0, mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 10.0})
-#: An estimate at less than this share of the requested rate is reported, and a longer pause in all
-#: messages, s: the largest age of a velocity for braking.
+#: An estimate at less than this share of the requested rate is reported.
 FEW: Final[float] = 0.5
+#: A longer pause in all messages is reported, s: the largest age of a velocity for braking.
 PAUSE: Final[float] = 0.3
-#: Period of requests for the reasons that prevent arming, s, while disarmed; and the time in which
-#: the autopilot reports them, s, after which an unanswered request is repeated.
+#: Period of requests for the reasons that prevent arming while disarmed, s.
 WHY_PERIOD: Final[float] = 30.0
+#: The autopilot reports them within this, s; then an unanswered request is repeated.
 WHY_WAIT: Final[float] = 3.0
 UNSIGNED: Final[str] = (
     'the autopilot signs its messages and answers none of ours: set signing_key_file')
@@ -212,7 +212,7 @@ class Housekeeping:
             self.parameters, self.watch = self._new_check(), ParameterWatch()
             self.origin.begin_again()
         self._request_streams(now)
-        if now - self._timesync_sent >= PERIOD:
+        if now - self._timesync_sent >= TIMESYNC_PERIOD:
             self._timesync_sent = now
             self._link.send(self.timesync.request(to_nanoseconds(now)))
         self.origin.step(None if dialect is None else self.parameters.values.get(
@@ -277,7 +277,7 @@ class Housekeeping:
 
     def too_slow(self, now: float) -> str:
         """Return that the rate of the estimate is too low, or that the link stalls, or ''."""
-        if now - self._alive_since < RECENT + PERIOD:
+        if now - self._alive_since < REPORT_WINDOW + TIMESYNC_PERIOD:
             return ''  # the streams were requested too recently
         problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} requested'
                     for name, rate in self.rates(now).items()
@@ -285,7 +285,7 @@ class Housekeeping:
         pause = self._link.telemetry.arrivals.longest_pause(now)
         if pause > PAUSE:
             problems.append(f'nothing came from the autopilot for {pause:.2f} s in the last '
-                            f'{RECENT:g} s')
+                            f'{REPORT_WINDOW:g} s')
         return '; '.join(problems)
 
     def _request_streams(self, now: float) -> None:

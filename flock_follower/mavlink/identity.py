@@ -30,29 +30,34 @@ from typing import Any, Final, Generic, TypeVar
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialects import enum_name, VTOLS
+from flock_follower.mavlink.dialects import enum_name, VTOL_TYPES
 
 T = TypeVar('T')
 #: Two sources that send in turn so many times are two.
 TURNS: Final[int] = 6
-#: A source that was silent for longer than this, s, is forgotten; a finding lasts longer, s.
+#: A source that was silent for longer than this, s, is forgotten.
 MEMORY: Final[float] = 3.0
+#: A finding lasts this long, s.
 FINDING: Final[float] = 5.0
 #: Times of boot that differ by more than this, s, are those of two vehicles; the delay of a line
 #: varies by less from message to message.
 BOOTS_DIFFER: Final[float] = 1.0
-#: For one vehicle that arrives by another way: the least of some, which excludes delays, s.
+#: Those of one vehicle that arrives by another way differ by less, s.
 SAME_BOOT: Final[float] = 0.3
+#: The least of this many times of boot counts, which excludes delays.
 _BOOTS: Final[int] = 20
-#: Positions further apart than this, m, plus the way at this speed, m/s, are
-#: those of two vehicles. A single faster one never returns to where it was before.
+#: Positions further apart than this, m, plus the way since, are those of two vehicles. A single
+#: faster one never returns to where it was before.
 POSITIONS_DIFFER: Final[float] = 0.5
+#: Speed of that way, m/s.
 FLOWN: Final[float] = 5.0
 #: Messages of one sender that may be lost, or arrive in another order, in a row.
 MISSING_MOST: Final[int] = 16
+#: Most senders that are stored.
 _MOST_PEERS: Final[int] = 16
-#: HEARTBEATs of ours that may be echoed, and those of another that show it.
+#: HEARTBEATs of ours that may be echoed.
 _ECHOES: Final[int] = 5
+#: HEARTBEATs of another program that show it.
 _RIVAL_BEATS: Final[int] = 3
 TWO_VEHICLES: Final[str] = 'two vehicles send with one system id'
 SECOND_BRIDGE: Final[str] = 'another program sends with the ids of this bridge'
@@ -87,8 +92,9 @@ def not_hovering(vehicle_type: int | None, vtol_state: int | None) -> str:
 
     :param vehicle_type: MAV_TYPE. :param vtol_state: MAV_VTOL_STATE; None: not reported.
     """
-    if vtol_state == mavlink.MAV_VTOL_STATE_MC or (vehicle_type not in VTOLS and vtol_state in (
-            None, mavlink.MAV_VTOL_STATE_UNDEFINED)):
+    if vtol_state == mavlink.MAV_VTOL_STATE_MC or (
+            vehicle_type not in VTOL_TYPES and vtol_state in (
+                None, mavlink.MAV_VTOL_STATE_UNDEFINED)):
         return ''
     state = 'not reported' if vtol_state is None else enum_name('MAV_VTOL_STATE', vtol_state)
     return f'{FORWARD_FLIGHT}: {state}'

@@ -141,13 +141,15 @@ def frame_length(buffer: bytearray, start: int) -> int:
 
 
 #: Valid system and component ids of MAVLink; 0 means all.
-IDS: Final[Range] = Range(1, 255, whole=True)
+ID_RANGE: Final[Range] = Range(1, 255, whole=True)
 COMPONENT: Final[int] = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 AUTOPILOT_COMPONENT: Final[int] = mavlink.MAV_COMP_ID_AUTOPILOT1
 SIGNING_KEY_SIZE: Final[int] = 32
-# MAVLink's signing timestamps count 10 us from 2015-01-01.
+#: Beginning of MAVLink's signing timestamps, 2015-01-01, s.
 _SIGNING_EPOCH: Final[float] = 1420070400.0
+#: Those timestamps in a second: they count 10 us.
 _SIGNING_TICKS: Final[float] = 1e5
+#: Most senders that are stored.
 _MOST_PEERS: Final[int] = 16
 #: Messages and pieces of garbage that one call takes; a flood beyond that is dropped.
 MOST_PIECES: Final[int] = 300

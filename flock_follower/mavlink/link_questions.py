@@ -31,8 +31,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import enum_name
 
-#: After this time without any answer, s, and so many questions the line works one way only.
+#: After this time without any answer, s, the line works one way only.
 PATIENCE: Final[float] = 3.0
+#: It does so after this many questions at least.
 TRIES: Final[int] = 3
 NO_ANSWER: Final[str] = (
     'the autopilot answers none of our messages: transmit wire, port, system id')

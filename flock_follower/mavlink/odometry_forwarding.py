@@ -52,13 +52,16 @@ from flock_follower.messages import (
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is an error, s.
 FORWARDING_GAP: Final[float] = 0.1
 #: Older odometry than this, s, is not forwarded.
-OLDEST: Final[float] = 0.3
+OLDEST_FORWARDED: Final[float] = 0.3
 #: An attitude further than this, rad, from the prediction has jumped (a loop closure, a restart).
 ATTITUDE_JUMP: Final[float] = 0.2
 #: Quality sent for a covariance that is unknown, %.
 UNKNOWN_QUALITY: Final[int] = 50
+#: Rotation from ENU to NED (3, 3).
 _R_NED_ENU: Final[Array] = enu_to_ned(np.eye(3))
+#: Rotation from FLU to FRD (3, 3).
 _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
+#: Indices of the upper triangle of a covariance (6, 6).
 _UPPER = np.triu_indices(6)
 
 
@@ -82,7 +85,7 @@ class OdometryForwarder:
 
     def take(self, state: OdometryState, time: float, now: float) -> str:
         """Take odometry stamped at ``time``, s on our clock; return '' or why it is refused."""
-        if now - time > OLDEST:
+        if now - time > OLDEST_FORWARDED:
             return 'too old to forward'
         if time - now > FUTURE_TOLERANCE:
             return 'from the future, not forwarded'
@@ -108,7 +111,7 @@ class OdometryForwarder:
 
     def messages(self, dialect: Dialect, now: float) -> list[Any]:
         """Return the messages to send now, oldest first; states that are too old are dropped."""
-        fresh = [entry for entry in self._queue if now - entry[1] <= OLDEST]
+        fresh = [entry for entry in self._queue if now - entry[1] <= OLDEST_FORWARDED]
         if lost := len(self._queue) - len(fresh):
             self.counters['too old to send'] += lost
         self._queue.clear()
@@ -159,7 +162,7 @@ def quality(state: OdometryState, age: float) -> int:
         best = 100.0 * min(1.0, expected / deviation)
     else:
         best = UNKNOWN_QUALITY
-    return max(1, round(best * min(1.0, max(0.0, 1.0 - age / OLDEST))))
+    return max(1, round(best * min(1.0, max(0.0, 1.0 - age / OLDEST_FORWARDED))))
 
 
 def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_counter: int,

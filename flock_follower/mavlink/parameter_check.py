@@ -45,8 +45,9 @@ PATIENCE: Final[float] = 5.0
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
 #: MAV_PARAM_ERROR_DOES_NOT_EXIST, which older releases of pymavlink lack.
 DOES_NOT_EXIST: Final[int] = 1
-#: The firmware of an entry without ``Versions:``, major and minor.
+#: The first firmware of an entry without ``Versions:``, major and minor.
 _FIRST_VERSION = (0, 0)
+#: The last one.
 _LAST_VERSION = (255, 255)
 _ENTRY: Final = re.compile(
     r'(?:\d+\s+\d+\s+)?([A-Z]\w{0,15})[\s,]+([-+]?\d+(?:\.\d*)?)(?:\s+\d+)?')

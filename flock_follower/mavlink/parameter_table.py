@@ -26,7 +26,7 @@ from flock_follower.gate.flight_end import EndParams
 from flock_follower.gate.motion_sources import VELOCITY_SOURCES
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
 from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
-from flock_follower.mavlink.link import IDS
+from flock_follower.mavlink.link import ID_RANGE
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import filled, Spec, specs_of
@@ -41,10 +41,10 @@ MAVLINK_BRIDGE = [
          '/dev/DEVICE[,BAUD]'),
     Spec('autopilot', 'auto', 'firmware of the autopilot; auto: by its HEARTBEAT', AUTOPILOTS),
     Spec('target_system', 1,
-         'MAVLink system id of the autopilot; others are ignored', IDS),
+         'MAVLink system id of the autopilot; others are ignored', ID_RANGE),
     Spec('source_system', 0,
          'own MAVLink system id; 0: that of target_system, as MAVLink requires of the companion '
-         'computer of a vehicle', replace(IDS, low=0)),
+         'computer of a vehicle', replace(ID_RANGE, low=0)),
     Spec('announce_as_gcs', False,
          'send the HEARTBEAT of a ground station, so that PX4 sends its STATUSTEXTs on this '
          'link, too. While the bridge runs, PX4 then counts a ground station as connected: the '

@@ -147,7 +147,7 @@ class Requests:
              f'still waiting for {pending.goal.name if pending is not None else ""}'))
         if goal.ends_flight:
             # From here on setpoints only brake, even if the autopilot refuses.
-            gate.permit(gate.permission.ended(end.why or f'{goal.name} requested', end.cause))
+            gate.permit(gate.permission.end(end.why or f'{goal.name} requested', end.cause))
             if pending is not None:
                 superseded = pending.refuse(f'superseded by {goal.name}').goal
         request = Request(dialect or PX4, goal, now, superseded, own=bool(end.why))
@@ -155,7 +155,7 @@ class Requests:
             return request.refuse(obstacle)
         self.newest = request
         if goal.name == OFFBOARD:
-            gate.permit(gate.permission.requested(now))
+            gate.permit(gate.permission.request(now))
         return request
 
     def step(self, streaming_for: float, now: float) -> None:
@@ -176,7 +176,7 @@ class Requests:
             request.outcome = request.outcome._replace(message=explained(
                 request.outcome.message, self._link.telemetry.estimator, now))
             if offboard:
-                self._gate.permit(permission.failed(request.outcome.message))
+                self._gate.permit(permission.fail(request.outcome.message))
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:
         telemetry, status, vehicle = self._link.telemetry, self.status(now), None
@@ -216,7 +216,7 @@ class Requests:
             reasons.append('no velocity known: neither odom nor LOCAL_POSITION_NED')
         if in_air:
             reasons += [IN_AIR[telemetry.flying(now)],
-                        envelope.outside(gate.limits, gate.heights.height(now))]
+                        envelope.refuse_height(gate.limits, gate.heights.height(now))]
         reasons += [self._housekeeping.watch.obstacle(), self._end.battery_low(now),
                     self._housekeeping.origin.obstacle,
                     misplaced(telemetry.local_place(now), telemetry.home(),
@@ -243,5 +243,5 @@ class Requests:
             return (f'{name} = {values.get(name, "unknown")} m: '
                     f'it would climb that high, above takeoff_height = {height:g} m')
         reached = envelope.Location(height + (self._gate.heights.height(now) or 0.0))
-        beyond = envelope.exceeded(limits, reached, 0.0)
+        beyond = envelope.find_exceeded_bound(limits, reached, 0.0)
         return beyond and f'it would end at {beyond}'

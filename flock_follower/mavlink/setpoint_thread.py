@@ -39,8 +39,9 @@ T = TypeVar('T')
 SHORTEST_PERIOD: Final[float] = 0.02
 #: Time to brake, hand over and end, s.
 EXIT_TIMEOUT: Final[float] = 1.7
-#: Submitted actions: how many may wait, and how many are run before the cycle has its turn.
+#: Most submitted actions that wait.
 MOST_WAITING: Final[int] = 1000
+#: Most of them that run before the cycle has its turn.
 MOST_AT_ONCE: Final[int] = 50
 
 

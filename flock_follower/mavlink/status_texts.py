@@ -135,7 +135,7 @@ class Failure(NamedTuple):
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
-CHUNK: Final[int] = 50
+CHUNK_SIZE: Final[int] = 50
 #: A text whose next chunk does not arrive within this, s, is used as it is.
 CHUNK_TIMEOUT: Final[float] = 0.4
 
@@ -171,7 +171,7 @@ class StatusTexts:
         before = '' if self._begun is None else self._begun.text
         self._begun = AutopilotText(now, message.severity, before + text)
         self._due = message.id, message.chunk_seq + 1
-        if not message.id or len(text) < CHUNK:
+        if not message.id or len(text) < CHUNK_SIZE:
             self._end()
 
     def add_event(self, message: Any, now: float) -> None:
@@ -256,8 +256,9 @@ class StatusTexts:
 
 #: A state is reported once it has lasted this long, s: not COAST for one image.
 HELD: Final[float] = 1.0
-#: Least time between two texts, s, and between two distances, s.
+#: Least time between two texts, s.
 TEXT_PERIOD: Final[float] = 2.0
+#: Least time between two distances, s.
 DISTANCE_PERIOD: Final[float] = 1.0
 #: Name of the NAMED_VALUE_FLOAT, at most 10 bytes.
 DISTANCE_NAME: Final[bytes] = b'flock_dist'
@@ -283,7 +284,7 @@ class GroundStationReport:
             self._state, self._state_time = state, now
 
     def take_distance(self, neighbor: str, distance: float, now: float) -> None:
-        """Take the distance, m, to the neighbour that the planner faces."""
+        """Take the distance, m, to the neighbor that the planner faces."""
         self._neighbor, self._distance, self._distance_time = neighbor, distance, now
 
     def take_handover(self, reason: str) -> None:
@@ -317,5 +318,5 @@ class GroundStationReport:
         else:
             return messages
         self._last_text = now
-        data = f'flock: {text}'.encode('ascii', 'replace')[:CHUNK]
+        data = f'flock: {text}'.encode('ascii', 'replace')[:CHUNK_SIZE]
         return [*messages, mavlink.MAVLink_statustext_message(severity, data)]

@@ -32,15 +32,19 @@ from flock_follower.mavlink.parameter_check import ParameterCheck
 #: From this version on PX4 takes over for fast sticks only.
 FAST_STICKS_SINCE: Final[tuple[int, int]] = (1, 18)
 #: Consecutive messages in which a stick must have moved.
-MESSAGES: Final[int] = 2
+MOVED_MESSAGES: Final[int] = 2
 #: Two messages further apart than this, s, are not consecutive: the transmitter was lost between.
-GAP: Final[float] = 1.0
+STICK_GAP: Final[float] = 1.0
 #: The throttle is at its center within this share of full deflection.
 CENTER: Final[float] = 0.1
-#: Pulse lengths of a working receiver, us; the center, and the way from there to an end.
+#: Pulse lengths of a working receiver, us.
 _PULSES: Final = range(800, 2201)
-_PULSE_CENTER, _PULSE_RANGE = 1500.0, 500.0
-_FULL: Final[float] = 1000.0  # of MANUAL_CONTROL
+#: Pulse length of the center, us.
+_PULSE_CENTER: Final[float] = 1500.0
+#: From there to an end, us.
+_PULSE_RANGE: Final[float] = 500.0
+#: Full deflection in MANUAL_CONTROL.
+_FULL: Final[float] = 1000.0
 #: Sources of the sticks; the first one counts alone once it was received: it ends with the
 #: transmitter, while RC_CHANNELS goes on with the values that the receiver is set to.
 KINDS: Final[tuple[str, str]] = ('MANUAL_CONTROL', 'RC_CHANNELS')
@@ -101,7 +105,7 @@ class StickWatch:
     def begin(self, now: float) -> None:
         """Take the positions at ``now``, or those received next, as the rest positions."""
         self.moved = False
-        self._rest = self._newest if now - self._time <= GAP else None
+        self._rest = self._newest if now - self._time <= STICK_GAP else None
         self._counts = dict.fromkeys(self._counts, 0)
 
     def take(self, message: Any, now: float, lost: bool = False) -> None:
@@ -119,7 +123,7 @@ class StickWatch:
             self._newest, self._time = None, -math.inf
             self._restart()
             return
-        if now - self._time > GAP:
+        if now - self._time > STICK_GAP:
             self._restart()
         self._newest, self._time = sticks, now
         if self._rest is None:
@@ -130,14 +134,14 @@ class StickWatch:
         """Count anew; a throttle that was away stays so."""
         away = self._counts['throttle away']
         self._counts = dict.fromkeys(self._counts, 0)
-        self._counts['throttle away'] = away if away >= MESSAGES else 0
+        self._counts['throttle away'] = away if away >= MOVED_MESSAGES else 0
 
     def _count(self, sticks: Sticks, rest: Sticks) -> None:
         way = [abs(now - before) for now, before in zip(sticks, rest)]
         counts = self._counts
-        away = counts['throttle away'] >= MESSAGES or way[-1] > self._threshold
+        away = counts['throttle away'] >= MOVED_MESSAGES or way[-1] > self._threshold
         for name, true in (('stick', max(way[:-1]) > self._threshold), ('throttle away', away),
                            ('throttle back', away and abs(sticks.throttle) <= CENTER)):
             counts[name] = counts[name] + 1 if true else 0
         back = min(counts['throttle away'], counts['throttle back'])
-        self.moved |= max(counts['stick'], back) >= MESSAGES
+        self.moved |= max(counts['stick'], back) >= MOVED_MESSAGES

@@ -37,9 +37,10 @@ PILOT: Final[Taker] = Taker('the pilot took over', True)
 BATTERY, FENCE, STREAM = 'low battery', 'fence', 'no setpoint stream'
 TRANSMITTER, STATION, ESTIMATE = 'transmitter lost', 'ground station lost', 'no position estimate'
 UNNAMED: Final[str] = 'unknown cause'
-#: Evidence is used from this long before the mode was left, s, until this long after.
+#: Evidence is used from this long before the mode was left, s.
 BEFORE: Final[float] = 3.0
-AFTER: Final[float] = 2.0
+#: It is used until this long after, s.
+EVIDENCE_AFTER: Final[float] = 2.0
 #: The bridge stops its stream when the mode is left: a later report of a missing stream, s, is
 #: its effect.
 STREAM_AFTER: Final[float] = 0.3
@@ -120,8 +121,8 @@ class TakeoverWatch:
     def _name(self, left: float) -> str:
         """Return the cause of a failsafe at a time, s, or ''."""
         named, time = self._named
-        if left - BEFORE <= time <= left + AFTER:
+        if left - BEFORE <= time <= left + EVIDENCE_AFTER:
             return named
         return next((cause for cause in _ORDER
                      if left - BEFORE <= self._checks.get(cause, -math.inf) <= left + (
-                         STREAM_AFTER if cause == STREAM else AFTER)), '')
+                         STREAM_AFTER if cause == STREAM else EVIDENCE_AFTER)), '')

@@ -40,8 +40,9 @@ T = TypeVar('T')
 RETRY_PERIOD: Final[float] = 0.5
 #: A line is congested if sending the waiting bytes takes longer than this, s.
 LONGEST_BACKLOG: Final[float] = 0.02
-#: A TCP connection without traffic for this long, ms, is closed; size of its buffer, bytes.
+#: A TCP connection without traffic for this long, ms, is closed.
 LONGEST_TCP_DELAY: Final[int] = 1000
+#: Size of its buffer, bytes.
 TCP_BUFFER: Final[int] = 16384
 #: It is congested if more bytes than this are not acknowledged.
 TCP_BACKLOG: Final[float] = 1000.0

@@ -211,7 +211,7 @@ class MavlinkBridge(FlockNode):
         if self._sources.another(number, now - waited) and self._flying():
             who = self._report.problems.commanders.publishers()
             gate = self._bridge.gate
-            self._stream.submit(lambda: gate.permit(gate.permission.contested(who)))
+            self._stream.submit(lambda: gate.permit(gate.permission.contest(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""

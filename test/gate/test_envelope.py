@@ -26,11 +26,11 @@ from situations import judge_situation
 from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import (
     approach_speed,
-    exceeded,
+    find_exceeded_bound,
     GateLimits,
     inward,
     Location,
-    outside,
+    refuse_height,
     vertical_range,
 )
 from flock_follower.gate.gate import Gate
@@ -49,7 +49,7 @@ class FlownGate:
 
     def __init__(self, limits, height=3.0, thrust_error=0.0):
         self.gate = Gate(limits, 'odom')
-        self.gate.permit(Permission().requested(-1.0))
+        self.gate.permit(Permission().request(-1.0))
         self.gate.take_status(FLOWN, 0.0)
         self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
         self.response, self.error = np.zeros(3), np.array([0.0, 0.0, thrust_error])
@@ -138,9 +138,11 @@ def test_a_thrust_that_cannot_be_offset_is_handed_over(thrust_error):
     (Location(0.4, 0.0, np.array([50.1, 0.0])), '')])  # tolerated
 def test_the_reasons_name_the_parameter(place, reason):
     limits = GateLimits()
-    assert reason in exceeded(limits, place) and bool(reason) == bool(exceeded(limits, place))
-    assert 'height_min' in outside(limits, 0.4) and 'height_max' in outside(limits, 10.1)
-    assert 'SCALED_PRESSURE' in outside(limits, None) and outside(limits, 2.0) == ''
+    exceeded = find_exceeded_bound(limits, place)
+    assert reason in exceeded and bool(reason) == bool(exceeded)
+    assert 'height_min' in refuse_height(limits, 0.4)
+    assert 'height_max' in refuse_height(limits, 10.1)
+    assert 'SCALED_PRESSURE' in refuse_height(limits, None) and refuse_height(limits, 2.0) == ''
 
 
 @given(st.floats(0.0, 1e4), st.floats(0.01, 20.0))
@@ -164,7 +166,7 @@ def test_the_bounds_are_those_of_the_approach_speeds():
 def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
     limits = GateLimits()
     rng, gate = np.random.default_rng(5), Gate(limits, 'odom')
-    gate.permit(Permission().requested(-1.0))
+    gate.permit(Permission().request(-1.0))
     gate.take_status(FLOWN, 0.0, airborne=None)
     sent = []
     for k in range(400):

@@ -33,7 +33,7 @@ NOT_FLOWN = VehicleStatus(True, 'POSCTL', False)
 
 def fly(gate, now, status=FLOWN):
     """Permit setpoints, which the vehicle obeys unless its status says otherwise."""
-    gate.permit(gate.permission.requested(now - 0.001))
+    gate.permit(gate.permission.request(now - 0.001))
     gate.take_status(status, now)
     return gate
 
@@ -156,7 +156,7 @@ def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one
     assert gate.commands.is_new
     # Once, though it is not sent: without a velocity the gate levels the vehicle.
     assert decide(gate, 10.0).kind == 'level' and not gate.commands.is_new
-    gate.permit(gate.permission.ended('hold'))
+    gate.permit(gate.permission.end('hold'))
     assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == 'while GIVING_BACK'
     assert not gate.commands.is_new
 
@@ -213,13 +213,13 @@ def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_f
     gate.take_status(FLOWN, 10.0)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
     assert gate.decide(10.0)[0].kind == 'none'
-    gate.permit(gate.permission.requested(10.0))
+    gate.permit(gate.permission.request(10.0))
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while READY'
     gate.take_status(FLOWN, 10.01)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.02) == ''
     assert gate.decide(10.03)[0].kind == 'command'
-    gate.permit(gate.permission.ended('hold'))
-    gate.permit(gate.permission.requested(10.04))
+    gate.permit(gate.permission.end('hold'))
+    gate.permit(gate.permission.request(10.04))
     gate.take_status(FLOWN, 10.05)
     assert gate.permission.phase.name == 'ACTIVE'
     assert gate.decide(10.06)[0].kind == 'brake'

@@ -39,16 +39,16 @@ DISARMED = OURS._replace(armed=False)
 HOLD = VehicleStatus(True, 'AUTO.LOITER', False)
 PILOT = VehicleStatus(True, 'POSCTL', False)
 # Events: the name of the transition, and its arguments.
-ASKED = 'requested', 1.0
-ENDED = 'ended', 'hold requested'
-REBOOTED = 'restarted', 'the autopilot rebooted'
-SECOND = 'contested', '/planner, /other'
-LANDED = 'landed',
+ASKED = 'request', 1.0
+ENDED = 'end', 'hold requested'
+REBOOTED = 'reset', 'the autopilot rebooted'
+SECOND = 'contest', '/planner, /other'
+LANDED = 'land',
 GROUND = 'on the ground'
 
 
 def seen(status, received=2.0, airborne=True):
-    return 'seen', status, received, airborne
+    return 'follow_status', status, received, airborne
 
 
 def next_permission(permission, event):
@@ -66,7 +66,7 @@ def after(*events):
 @pytest.mark.parametrize('events', [
     (), (seen(HOLD),), (seen(OURS),), (seen(HOLD), seen(OURS), seen(OURS)),
     (LANDED, seen(OURS)), (ENDED, seen(OURS)),
-    (REBOOTED, seen(OURS)), (('failed', 'late'), seen(OURS))])
+    (REBOOTED, seen(OURS)), (('fail', 'late'), seen(OURS))])
 def test_nothing_may_be_sent_before_offboard_was_requested_whatever_the_mode(events):
     assert not after(*events).streams
 
@@ -75,20 +75,20 @@ def test_a_request_streams_and_the_mode_in_the_air_makes_it_active():
     assert (after(ASKED).phase, after(ASKED).reason) == (
         Phase.READY, 'waiting for offboard mode')
     waiting = after(ASKED, seen(HOLD), seen(OURS, airborne=None))
-    assert waiting.announced() == 'READY: OFFBOARD, not reported to fly'
-    assert next_permission(waiting, seen(OURS)).announced() == 'ACTIVE'
+    assert waiting.announcement() == 'READY: OFFBOARD, not reported to fly'
+    assert next_permission(waiting, seen(OURS)).announcement() == 'ACTIVE'
 
 
 @pytest.mark.parametrize('status', [OURS, HOLD])
 def test_on_the_ground_or_disarmed_a_request_ends(status):
-    assert after(ASKED, seen(status, airborne=False)).announced() == f'INACTIVE: {GROUND}'
+    assert after(ASKED, seen(status, airborne=False)).announcement() == f'INACTIVE: {GROUND}'
     disarmed = after(ASKED, seen(status._replace(armed=False)), seen(OURS))
-    assert disarmed.announced() == 'INACTIVE: disarmed'
+    assert disarmed.announcement() == 'INACTIVE: disarmed'
 
 
 @pytest.mark.parametrize('events', [(), (seen(OURS),), (seen(OURS), ENDED)])
 def test_a_landing_ends_the_permission(events):
-    assert after(ASKED, *events, LANDED, seen(OURS)).announced() == f'INACTIVE: {GROUND}'
+    assert after(ASKED, *events, LANDED, seen(OURS)).announcement() == f'INACTIVE: {GROUND}'
 
 
 def test_a_takeover_bars_offboard_for_ten_seconds():
@@ -96,12 +96,12 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
     for now, seconds in ((4.0, 0), (5.0, 0), (11.0, 6)):
         assert permission.taken_over(now).startswith(
             f'the pilot, or a failsafe, took over {seconds} s ago')
-        assert permission.attributed(STICK, now).taken_over(now).startswith('the pilot took over')
+        assert permission.name_taker(STICK, now).taken_over(now).startswith('the pilot took over')
     assert permission.taken_over(14.9)
-    failed = permission.attributed(takeover.failsafe('fence'), 6.0)
+    failed = permission.name_taker(takeover.failsafe('fence'), 6.0)
     assert not failed.taken_over(6.0)
-    assert failed.announced() == 'TAKEN_OVER: offboard was left for POSCTL: failsafe: fence'
-    assert failed.attributed(takeover.PILOT, 16.0).taken_over(25.9)  # a later pilot
+    assert failed.announcement() == 'TAKEN_OVER: offboard was left for POSCTL: failsafe: fence'
+    assert failed.name_taker(takeover.PILOT, 16.0).taken_over(25.9)  # a later pilot
     assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
@@ -112,7 +112,7 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
     ((ASKED, seen(OURS, airborne=None)), True),
     ((ASKED, seen(OURS), ENDED), True), ((ASKED, seen(OURS), seen(DISARMED)), False),
     ((ASKED, seen(OURS), seen(PILOT)), False), ((ASKED, seen(OURS), REBOOTED), False),
-    ((ASKED, seen(OURS), seen(PILOT), ('requested', 3.0)), False)])
+    ((ASKED, seen(OURS), seen(PILOT), ('request', 3.0)), False)])
 def test_it_flies_from_when_the_mode_is_seen_until_it_streams_no_more(events, flies):
     assert after(*events).flies is flies
 
@@ -123,17 +123,17 @@ def test_a_heartbeat_from_before_the_request_has_no_effect(received):
 
 
 def test_a_refused_request_ends_and_without_a_velocity_the_stream_falls_silent():
-    assert after(ASKED, ('failed', 'refused')).announced() == 'INACTIVE: refused'
-    silent = after(ASKED, seen(OURS), ('blinded', 'no velocity'))
-    assert silent.announced() == 'INACTIVE: fell silent: no velocity'
+    assert after(ASKED, ('fail', 'refused')).announcement() == 'INACTIVE: refused'
+    silent = after(ASKED, seen(OURS), ('fall_silent', 'no velocity'))
+    assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
     for idle in (after(), after(ASKED, seen(OURS), seen(PILOT))):
-        assert next_permission(idle, ('failed', 'refused')) is idle
-        assert next_permission(idle, ('blinded', 'no velocity')) is idle
+        assert next_permission(idle, ('fail', 'refused')) is idle
+        assert next_permission(idle, ('fall_silent', 'no velocity')) is idle
 
 
 def test_a_late_refusal_ends_nothing_that_the_vehicle_obeys_already():
     for obeying in (after(ASKED, seen(OURS)), after(ASKED, seen(OURS, airborne=None))):
-        assert next_permission(obeying, ('failed', 'late')) is obeying
+        assert next_permission(obeying, ('fail', 'late')) is obeying
         assert next_permission(obeying, ENDED).phase is Phase.GIVING_BACK
 
 
@@ -145,21 +145,21 @@ def test_active_it_stays_from_heartbeat_to_heartbeat(airborne):
 
 def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
     giving = after(ASKED, seen(OURS), ENDED, seen(OURS))
-    assert giving.announced() == 'READY: giving back: hold requested'
+    assert giving.announcement() == 'READY: giving back: hold requested'
     assert giving.streams and giving.flies
-    assert next_permission(giving, seen(HOLD)).announced() == (
+    assert next_permission(giving, seen(HOLD)).announcement() == (
         'INACTIVE: given back (hold requested)')
-    assert next_permission(giving, seen(DISARMED)).announced() == (
+    assert next_permission(giving, seen(DISARMED)).announcement() == (
         'INACTIVE: given back (hold requested)')
-    assert after(ASKED, seen(HOLD), ENDED).announced() == 'INACTIVE: hold requested'
+    assert after(ASKED, seen(HOLD), ENDED).announcement() == 'INACTIVE: hold requested'
 
 
 def test_where_two_nodes_command_it_brakes_until_asked_again():
     braking = after(ASKED, seen(OURS), SECOND)
-    assert braking.announced() == 'READY: giving back: two nodes command: /planner, /other'
+    assert braking.announcement() == 'READY: giving back: two nodes command: /planner, /other'
     assert braking.flies
     assert next_permission(braking, seen(OURS, 3.0)).phase is Phase.GIVING_BACK
-    again = next_permission(braking, ('requested', 4.0))
+    again = next_permission(braking, ('request', 4.0))
     assert next_permission(again, SECOND) is again  # it obeys no command yet
     assert next_permission(again, seen(OURS, 4.5)).phase is Phase.ACTIVE
 
@@ -168,17 +168,17 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     active = after(ASKED, seen(OURS, 2.0), seen(OURS, 2.0 + LONGEST_SILENCE))
     assert active.phase is Phase.ACTIVE
     lost = next_permission(active, seen(OURS, active.received + LONGEST_SILENCE + 0.1))
-    assert lost.announced() == (
+    assert lost.announcement() == (
         'READY: giving back: mode unknown for 5 s, the pilot may have taken over')
-    assert active.unseen(LONGEST_SILENCE) is active
-    assert active.unseen(LONGEST_SILENCE + 0.1).announced() == lost.announced()
+    assert active.follow_silence(LONGEST_SILENCE) is active
+    assert active.follow_silence(LONGEST_SILENCE + 0.1).announcement() == lost.announcement()
     # Somebody has changed the mode meanwhile; a disarmed vehicle was landed.
     assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
     assert next_permission(lost, seen(DISARMED, 20.0)).phase is Phase.INACTIVE
     assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS, 2.0), seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS), seen(PILOT, 20.0)).phase is Phase.TAKEN_OVER
-    again = next_permission(lost, ('requested', 21.0))
+    again = next_permission(lost, ('request', 21.0))
     assert next_permission(again, seen(OURS, 21.5)).phase is Phase.ACTIVE
     # Before the mode was there nothing could be taken over.
     assert after(ASKED, seen(HOLD, 1.5), seen(OURS, 20.0)).phase is Phase.ACTIVE
@@ -186,8 +186,8 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
 
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [('requested', 1.0), ('unseen', 5.1), ('blinded', 'no velocity'), ('failed', 'late'),
-          LANDED, ENDED, REBOOTED, SECOND,
+EVENTS = [('request', 1.0), ('follow_silence', 5.1), ('fall_silent', 'no velocity'),
+          ('fail', 'late'), LANDED, ENDED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]
 
@@ -217,9 +217,9 @@ def test_nothing_but_a_request_lets_the_stream_begin_and_only_active_obeys_comma
     for event in events:
         before, permission = permission, next_permission(permission, event)
         name, status, received, airborne = (*event, None, None, None)[:4]
-        new = name == 'seen' and received > before.since
+        new = name == 'follow_status' and received > before.since
         if permission.streams and not before.streams:
-            assert name == 'requested'
+            assert name == 'request'
         if permission.phase is Phase.ACTIVE and before.phase is not Phase.ACTIVE:
             assert new and status.offboard and status.armed and airborne
         if new and before.phase is Phase.ACTIVE and not (status.offboard and status.armed):

@@ -128,7 +128,7 @@ class Flown:
         self.flown = []  # times of commands on the marker alone
 
     def permit(self):
-        self.gate.permit(self.gate.permission.requested(self.now - 0.001))
+        self.gate.permit(self.gate.permission.request(self.now - 0.001))
 
     def cycle(self, relative, status=OFFBOARD, command=True):
         self.now += 0.05

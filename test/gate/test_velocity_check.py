@@ -24,7 +24,8 @@ from flock_follower.gate.obstacle import Obstacle
 from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     difference,
-    displaced,
+    DISPLACEMENT_WINDOW,
+    find_displacement,
     finite_vector,
     known_motion,
     LATCH_TIME,
@@ -33,7 +34,6 @@ from flock_follower.gate.velocity_check import (
     Source,
     SourceMotion,
     VelocityComparison,
-    WINDOW,
     YAW_MEMORY,
 )
 
@@ -182,7 +182,7 @@ def test_equal_motions_differ_by_nothing_in_frames_that_are_turned(turn):
 
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
-@pytest.mark.parametrize(('seconds', 'shown'), [(12.0, 0.2 * WINDOW), (2.0, 0.4)])
+@pytest.mark.parametrize(('seconds', 'shown'), [(12.0, 0.2 * DISPLACEMENT_WINDOW), (2.0, 0.4)])
 def test_a_velocity_error_adds_up_over_the_window(axis, seconds, shown):
     drift = np.eye(3)[axis]
     first, second = paths(seconds, lambda t: 0.2 * t * drift, still)
@@ -213,7 +213,7 @@ def test_displacements_that_differ_beyond_their_deviations_are_reported(
     odom, autopilot = Source(), Source()
     odom.path, autopilot.path = paths(4.0, lambda t: drift * t / 4.0 * np.eye(3)[axis], still)
     odom.std = std
-    why = displaced(odom, None if height else autopilot, 0.0,
+    why = find_displacement(odom, None if height else autopilot, 0.0,
                     autopilot.path if height else Path(), 4.0)
     assert bool(why) == contradicts
     assert not why or ('barometer' in why.detail) == height

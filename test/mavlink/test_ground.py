@@ -38,7 +38,7 @@ def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
 @pytest.mark.parametrize('height', [0.2, None])
 def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(height):
     control = Gate(velocity_source='odom')
-    control.permit(Permission().requested(0.0))
+    control.permit(Permission().request(0.0))
     ended = []
     for k in range(60):
         now = 1.0 + 0.05 * k

@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from flock_follower.gate.envelope import (
+    HEIGHT_TIMEOUT,
     HeightEstimator,
     MAX_CORRECTION,
     pressure_altitude,
     STEP_PAUSE,
-    TIMEOUT,
 )
 from flock_follower.gate.obstacle import Obstacle
 
@@ -74,8 +74,8 @@ def test_a_climb_is_followed_whatever_the_odometry_says_of_it(rate):
 @pytest.mark.parametrize('lacks', [0.0, 0.3, -0.3])
 def test_the_other_source_is_corrected_within_seconds_and_hardly_disturbed(lacks):
     heights, _ = flown(20.0, altitude=lambda t: 100.0 + lacks * t)
-    assert heights.corrected(2.0, 20.0) == pytest.approx(2.0 + lacks, abs=0.05)
-    assert heights.corrected(2.0, 20.0 + TIMEOUT) == 2.0
+    assert heights.correct(2.0, 20.0) == pytest.approx(2.0 + lacks, abs=0.05)
+    assert heights.correct(2.0, 20.0 + HEIGHT_TIMEOUT) == 2.0
 
 
 @pytest.mark.parametrize('jump', [0.5, -0.5, 2.0, 30.0])
@@ -99,11 +99,12 @@ def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     assert heights.height(1.0) is None and heights.altitude(1.0) == 50.0
     heights.refer(1.5, 1.0)
     assert heights.height(1.0) == 1.5
-    assert heights.height(1.01 + TIMEOUT) is None and heights.obstacle(1.01 + TIMEOUT)
+    late = 1.01 + HEIGHT_TIMEOUT
+    assert heights.height(late) is None and heights.obstacle(late)
     heights.take(52.0, None, 9.0)  # it comes back
     assert heights.height(9.0) == 3.5
     heights.refer(None, 9.0)
-    assert not heights.referenced
+    assert not heights.has_reference
 
 
 @pytest.mark.parametrize('referenced', [False, True])
@@ -118,7 +119,7 @@ def test_another_sensor_takes_over_without_a_jump_of_height_or_climb_rate(first,
                      'SCALED_PRESSURE' if barometer else 'DISTANCE_SENSOR')
         if k == 0 and referenced:
             heights.refer(2.0, now)
-        assert heights.corrected(-0.7, now) == pytest.approx(-0.7, abs=0.1)
+        assert heights.correct(-0.7, now) == pytest.approx(-0.7, abs=0.1)
         if referenced:
             assert heights.height(now) == pytest.approx(2.0 - 0.7 * now, abs=0.15)
     assert math.isinf(heights.stepped)
@@ -128,10 +129,10 @@ def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
     heights = HeightEstimator()
     heights.take(2.0, None, 0.0, 'DISTANCE_SENSOR')
     heights.refer(2.0, 0.0)
-    heights.take(492.0, None, 0.1 + TIMEOUT, 'SCALED_PRESSURE')
-    assert not heights.referenced and heights.height(0.1 + TIMEOUT) is None
+    heights.take(492.0, None, 0.1 + HEIGHT_TIMEOUT, 'SCALED_PRESSURE')
+    assert not heights.has_reference and heights.height(0.1 + HEIGHT_TIMEOUT) is None
     # The vehicle must not fly on without its bounds.
-    assert heights.missing(0.1 + TIMEOUT) and heights.obstacle(0.1 + TIMEOUT) is (
+    assert heights.is_missing(0.1 + HEIGHT_TIMEOUT) and heights.obstacle(0.1 + HEIGHT_TIMEOUT) is (
         Obstacle.HEIGHT_STALE)
 
 
@@ -140,7 +141,7 @@ def test_a_jump_of_the_barometer_corrects_the_vertical_velocity_by_its_bound_at_
     for k in range(100):
         now = k * PERIOD
         heights.take(2.0 + (30.0 if k >= 40 else 0.0) + 5.0 * max(now - 2.0, 0.0), 0.0, now)
-        assert abs(heights.corrected(0.0, now)) <= MAX_CORRECTION
+        assert abs(heights.correct(0.0, now)) <= MAX_CORRECTION
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
@@ -152,7 +153,7 @@ def test_whatever_comes_height_and_rate_are_finite_or_unknown(samples):
     heights, now = HeightEstimator(), 0.0
     for altitude, rate, pause in samples:
         now += pause
-        if heights.take(altitude, rate, now) == '' and not heights.referenced:
+        if heights.take(altitude, rate, now) == '' and not heights.has_reference:
             heights.refer(0.0, now)
         height = heights.height(now)
         assert height is None or math.isfinite(height)

@@ -28,7 +28,7 @@ from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
     jumped,
     OdometryForwarder,
-    OLDEST,
+    OLDEST_FORWARDED,
     quality,
     UNKNOWN_QUALITY,
 )
@@ -146,7 +146,8 @@ def test_the_quality_falls_with_covariance_and_age_and_is_never_unknown():
     def of(std, age=0.0):
         return quality(sample(twist=np.eye(6) * std ** 2)[0], age)
     assert [of(std) for std in (0.01, 0.1, 0.2, 1.0, 100.0)] == [100, 100, 50, 10, 1]
-    assert [of(0.1, age) for age in (-0.1, 0.0, 0.5 * OLDEST, OLDEST, 9.0)] == [100, 100, 50, 1, 1]
+    ages = -0.1, 0.0, 0.5 * OLDEST_FORWARDED, OLDEST_FORWARDED, 9.0
+    assert [of(0.1, age) for age in ages] == [100, 100, 50, 1, 1]
     assert of(0.0) == of(math.nan) == UNKNOWN_QUALITY
     for dialect in (PX4, ARDUPILOT):
         forwarder = OdometryForwarder()

@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.dialects import PX4
-from flock_follower.mavlink.estimator_health import Arrivals, RECENT
+from flock_follower.mavlink.estimator_health import Arrivals, REPORT_WINDOW
 from flock_follower.mavlink.housekeeping import STREAM_REQUEST_PERIOD, wanted_rates
 
 POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
@@ -86,7 +86,7 @@ def test_all_is_asked_for_at_the_start_and_what_another_one_lowers_again(
     flight.fly(seconds)
     assert set(intervals(flight, since)) - NEVER == {message_id}
     if message_id == POSITION:
-        flight.fly(RECENT)
+        flight.fly(REPORT_WINDOW)
         assert intervals(flight, since).count(POSITION) == 1
         assert flight.bridge.housekeeping.rates(flight.now)['LOCAL_POSITION_NED'] == (
             pytest.approx(50.0, abs=0.5))

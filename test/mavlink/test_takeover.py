@@ -25,10 +25,10 @@ from flock_follower.gate.permission import Phase, UNKNOWN
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.status_texts import event_number, EventMessage, MESSAGE_ID
 from flock_follower.mavlink.takeover import (
-    AFTER,
     BATTERY,
     BEFORE,
     ESTIMATE,
+    EVIDENCE_AFTER,
     failsafe,
     FENCE,
     PILOT,
@@ -101,7 +101,7 @@ FAILSAFE = 0.0, mode(PX4, 'AUTO.RTL', 'OFFBOARD')
     ([(-0.1, event('check_modes_offboard_signal')), FAILSAFE], failsafe(STREAM)),
     # A missing stream later is the effect of the takeover.
     ([FAILSAFE, (STREAM_AFTER + 0.1, event('check_modes_offboard_signal'))], failsafe(UNNAMED)),
-    ([FAILSAFE, (AFTER + 0.1, entered(3))], failsafe(UNNAMED)),
+    ([FAILSAFE, (EVIDENCE_AFTER + 0.1, entered(3))], failsafe(UNNAMED)),
     ([(-BEFORE - 0.1, entered(3)), FAILSAFE], failsafe(UNNAMED))])
 def test_on_px4_the_chosen_mode_shows_a_pilot_and_events_name_a_failsafe(messages, cause):
     assert judged(PX4, *messages) == cause
@@ -139,7 +139,7 @@ def test_the_failsafe_of_the_real_ardupilot_without_vision_is_named():
 def test_who_took_over_on_the_real_px4_is_named(name, cause):
     watch, flown, left = TakeoverWatch(), '', None
     for time, message in decoded(name):
-        if left is not None and time > left + AFTER:
+        if left is not None and time > left + EVIDENCE_AFTER:
             break
         watch.take(message, PX4, time)
         if message.get_type() == 'CURRENT_MODE':

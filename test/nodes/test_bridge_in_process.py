@@ -122,7 +122,7 @@ class Bench(Driven):
             0, mavlink.MAV_LANDED_STATE_IN_AIR))
         self.wait(lambda: self.bridge.telemetry.flying(time.monotonic()))
         gate = self.bridge.gate
-        self.node._stream.submit(lambda: gate.permit(gate.permission.requested(time.monotonic())))
+        self.node._stream.submit(lambda: gate.permit(gate.permission.request(time.monotonic())))
         self.wait(lambda: gate.permission.streams)
         self.beat()
         self.wait(self.node._flying)

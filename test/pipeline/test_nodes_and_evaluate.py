@@ -158,7 +158,7 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16,
             mavlink.MAV_STATE_ACTIVE, 3).pack(vehicle), in_air]
         node._bridge.receive(seconds())
-    node._bridge.gate.permit(Permission().requested(-math.inf))
+    node._bridge.gate.permit(Permission().request(-math.inf))
     beat()
 
     expected = published(result, '/setpoint')
