@@ -127,7 +127,7 @@ def ticks(count: int, flights: int) -> tuple[Array, Array, float]:
                 velocities[k] + VELOCITY_NOISE * rng.normal(size=3)) for k in range(count)]
             inputs.append((memory, own.stamp + 0.02, True, own, seen, params))
             memory, decision = step(*inputs[-1])
-            guarded += decision.guarded
+            guarded += decision.is_guarded
             a = np.zeros(3) if decision.acceleration is None else decision.acceleration
             velocity = own.velocity + params.period * a
             own = OwnState(own.stamp + params.period, own.position + params.period * velocity,

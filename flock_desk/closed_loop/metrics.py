@@ -155,7 +155,7 @@ class FlightsLog:
             'command': np.array([np.full(3, np.nan) if d.acceleration is None else d.acceleration
                                  for d in decisions]),
             'state': np.array([STATES.index(d.state) for d in decisions]),
-            'guarded': np.array([d.guarded for d in decisions]),
+            'guarded': np.array([d.is_guarded for d in decisions]),
             'seen': (lookout.seen & edges).any(axis=1),
             'in_sight': (lookout.in_sight & edges).any(axis=1),
             'obeying': np.array([f.obeying for f in followers]),

@@ -54,17 +54,17 @@ from flock_follower.messages import NANOSECONDS, OdometryState
 POSITION_DRIFT = 0.025  # m/sqrt(s): random walk of the odometry of each vehicle
 YAW_DRIFT = 0.0025  # rad/sqrt(s): likewise of its yaw
 VELOCITY_STD = 0.1  # m/s: of a received velocity without covariance
-#: chi^2 with 3 degrees of freedom, and with 1, at a probability of 0.999.
-GATE, YAW_GATE = 16.27, 10.83
+POSITION_GATE = 16.27  # chi^2 with 3 degrees of freedom at a probability of 0.999
+YAW_GATE = 10.83  # chi^2 with 1 degree of freedom at a probability of 0.999
 
 
-def turned(yaw: float) -> Array:
+def yaw_rotation(yaw: float) -> Array:
     """Return the rotation (3, 3) about the vertical by a yaw, rad."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def sideways(vector: Array) -> Array:
+def yaw_derivative(vector: Array) -> Array:
     """Return the derivative of a vector (3,) by a rotation about the vertical, per rad."""
     return np.array([-vector[1], vector[0], 0.0])
 
@@ -92,9 +92,9 @@ class Frame:
 
     def lever(self, position: Array) -> Array:
         """Return the vector (3,), m, in the own frame from the anchor to a position in it."""
-        return turned(self.yaw).dot(position - self.anchor)
+        return yaw_rotation(self.yaw).dot(position - self.anchor)
 
-    def located(self, position: Array) -> tuple[Array, Array]:
+    def locate(self, position: Array) -> tuple[Array, Array]:
         """Return a position in it in the own frame (3,), and the frame's share (3, 3) in it."""
         lever = self.lever(position)
         H = _jacobian(lever)[:3]
@@ -102,7 +102,7 @@ class Frame:
 
     def point(self, point: TrackPoint) -> TrackPoint:
         """Return a track point of it in the own frame."""
-        rotation, (position, share) = turned(self.yaw), self.located(point.position)
+        rotation, (position, share) = yaw_rotation(self.yaw), self.locate(point.position)
         return point._replace(
             position=position, velocity=rotation.dot(point.velocity),
             covariance=rotation.dot(point.covariance).dot(rotation.T) + share,
@@ -113,7 +113,7 @@ class Frame:
         """Move the anchor to the position (3,) of the vehicle in its frame."""
         lever = self.lever(position)
         J = np.eye(4)
-        J[1:, 0] = sideways(lever)
+        J[1:, 0] = yaw_derivative(lever)
         self.anchor, self.place = position, self.place + lever
         self.covariance = J.dot(self.covariance).dot(J.T)
 
@@ -121,7 +121,7 @@ class Frame:
         """Let both frames drift until a stamp, ns; the own one turns about a position (3,)."""
         elapsed = max(stamp - self.stamp, 0) / NANOSECONDS
         self.stamp = max(stamp, self.stamp)
-        about = np.array([1.0, *sideways(self.place - own_position)])
+        about = np.array([1.0, *yaw_derivative(self.place - own_position)])
         walk = np.array([0.0, 1.0, 1.0, 1.0])
         self.covariance = self.covariance + elapsed * (
             2.0 * POSITION_DRIFT ** 2 * np.diag(walk)
@@ -133,7 +133,7 @@ class Frame:
 
         Return the squared Mahalanobis distance of the two over the gate's: above 1 it is refused.
         """
-        rotation, lever = turned(self.yaw), self.lever(theirs.position)
+        rotation, lever = yaw_rotation(self.yaw), self.lever(theirs.position)
         H, noise = _jacobian(lever), np.zeros((4, 4))
         gap = np.append(self.place + lever - ours.position,
                         wrap_angle(self.yaw + theirs.yaw - ours.yaw))
@@ -141,7 +141,7 @@ class Frame:
         noise[3, 3] = theirs.yaw_variance + ours.yaw_variance
         across = self.covariance.dot(H.T)
         S = H.dot(across) + noise
-        doubt = float(gap[:3].dot(np.linalg.solve(S[:3, :3], gap[:3]))) / GATE
+        doubt = float(gap[:3].dot(np.linalg.solve(S[:3, :3], gap[:3]))) / POSITION_GATE
         if not doubt <= 1.0:  # NaN is refused
             return doubt
         # The error of attitudes is that of a marker's mounting: constant, no average reduces it.
@@ -160,22 +160,22 @@ class Frame:
 def _jacobian(lever: Array) -> Array:
     """Return the Jacobian (4, 4) of position and yaw at a lever (3,), m, by yaw and place."""
     H = np.zeros((4, 4))
-    H[:3, 0], H[:3, 1:], H[3, 0] = sideways(lever), np.eye(3), 1.0
+    H[:3, 0], H[:3, 1:], H[3, 0] = yaw_derivative(lever), np.eye(3), 1.0
     return H
 
 
-#: Pairs of a fit at least and at most, and their largest age, ns: older ones are useless by drift.
-FEWEST, MOST, PAIR_AGE_MAX = 5, 100, 20 * NANOSECONDS
-#: Errors of sightings are correlated in time: factor on the variances of a fit.
-WARINESS = 4.0
-#: Pairs with a larger chi^2 (3 degrees of freedom) are excluded; share of the pairs that must fit.
-OUTLIER, AGREEING = 25.0, 0.7
+MIN_PAIRS = 5  # pairs of a fit at least
+MAX_PAIRS = 100  # pairs of a fit at most
+PAIR_AGE_MAX = 20 * NANOSECONDS  # ns: drift makes older pairs useless
+VARIANCE_FACTOR = 4.0  # on the variances of a fit: errors of sightings are correlated in time
+OUTLIER_CHI2 = 25.0  # chi^2 (3 degrees of freedom) above which a pair is excluded from a fit
+MIN_AGREEING_SHARE = 0.7  # share of the pairs that must fit
 Pair = tuple[TrackPoint, TrackPoint]
 """Track points of one vehicle in another frame and in the own one, at one stamp."""
 
 
 def first_fit(pairs: Sequence[Pair]) -> Frame | None:
-    """Return the estimate of a frame by at least ``FEWEST`` pairs, or None if they disagree."""
+    """Return the estimate of a frame by at least ``MIN_PAIRS`` pairs, or None if they disagree."""
     # A row (9,): the positions in both frames, m; their variance, m^2, with the drift since; the
     # difference of the yaws, rad, and its variance, infinite if a yaw is unknown.
     newest = pairs[-1][0].stamp
@@ -186,11 +186,12 @@ def first_fit(pairs: Sequence[Pair]) -> Frame | None:
         ours.yaw - theirs.yaw, theirs.yaw_variance + ours.yaw_variance]
         for theirs, ours in pairs])
     found = _fit(rows, newest)
-    off = rows[:, 3:6] - found.place - (rows[:, :3] - found.anchor) @ turned(found.yaw).T
+    off = rows[:, 3:6] - found.place - (rows[:, :3] - found.anchor) @ yaw_rotation(found.yaw).T
     turns = (rows[:, 7] - found.yaw + math.pi) % (2.0 * math.pi) - math.pi
     misfit = np.maximum((off * off).sum(axis=1) / rows[:, 6], turns ** 2 / rows[:, 8])
-    agreeing = rows[misfit < OUTLIER]
-    return _fit(agreeing, newest) if len(agreeing) >= max(FEWEST, AGREEING * len(rows)) else None
+    agreeing = rows[misfit < OUTLIER_CHI2]
+    enough = len(agreeing) >= max(MIN_PAIRS, MIN_AGREEING_SHARE * len(rows))
+    return _fit(agreeing, newest) if enough else None
 
 
 def _fit(rows: Array, stamp: int) -> Frame:
@@ -200,13 +201,13 @@ def _fit(rows: Array, stamp: int) -> Frame:
     anchor, place = weights @ theirs / total, weights @ ours / total
     x, y = (theirs - anchor)[:, :2], (ours - place)[:, :2]
     # The mounting of a marker is constant: many attitudes are no better than one.
-    sure *= min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / max(float(sure.sum()), 1e-9))
+    sure *= min(1.0, VARIANCE_FACTOR / ATTITUDE_NOISE ** 2 / max(float(sure.sum()), 1e-9))
     along = weights @ (x * y).sum(axis=1) + sure @ np.cos(turns)
     across = weights @ (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]) + sure @ np.sin(turns)
     # Noise alone spreads points by their variance on two axes.
     known = sure.sum() + max(0.0, weights @ (x * x).sum(axis=1) - 2.0 * (len(rows) - 1))
-    covariance = np.diag([min(WARINESS / max(known, 1e-6), math.pi ** 2),
-                          *[WARINESS / total + SIGHTING_NOISE ** 2] * 3])
+    covariance = np.diag([min(VARIANCE_FACTOR / max(known, 1e-6), math.pi ** 2),
+                          *[VARIANCE_FACTOR / total + SIGHTING_NOISE ** 2] * 3])
     return Frame(math.atan2(across, along), place, anchor, covariance, stamp)
 
 
@@ -217,12 +218,12 @@ def in_own_frame(state: OdometryState, of_itself: bool, frame: Frame,
 
     :param of_itself: whether the vehicle sent it of itself; :param name: of the own frame.
     """
-    rotation, yaw_variance = turned(frame.yaw), float(frame.covariance[0, 0])
-    position, share = frame.located(state.position)
+    rotation, yaw_variance = yaw_rotation(frame.yaw), float(frame.covariance[0, 0])
+    position, share = frame.locate(state.position)
     velocity, spread = rotation.dot(state.velocity), state.velocity_covariance
     if not is_covariance(spread):
         spread = VELOCITY_STD ** 2 * np.eye(3)
-    swung = sideways(velocity)
+    swung = yaw_derivative(velocity)
     spread = rotation.dot(spread).dot(rotation.T) + yaw_variance * np.outer(swung, swung)
     quaternion = canonical_quaternion(quaternion_multiply(
         quaternion_from_yaw(frame.yaw), state.quaternion))

@@ -34,10 +34,10 @@ from __future__ import annotations
 from collections import defaultdict, deque
 import math
 
-from flock_follower.flock.alignment import FEWEST, first_fit, in_own_frame, PAIR_AGE_MAX
+from flock_follower.flock.alignment import first_fit, in_own_frame, MIN_PAIRS, PAIR_AGE_MAX
 from flock_follower.flock.peers import (
     ACCELERATION_STD,
-    aged,
+    age_covariances,
     checked_name,
     FRAME,
     FUTURE,
@@ -54,7 +54,7 @@ from flock_follower.flock.peers import (
     track_point,
     TrackPoint,
 )
-from flock_follower.flock.sender import BAN, Sender, WRONG
+from flock_follower.flock.sender import BAN_TIME, REALIGN_REFUSALS, Sender
 from flock_follower.messages import (
     DUPLICATE,
     MAX_JUMP,
@@ -67,18 +67,18 @@ from flock_follower.messages import (
 #: Between two rounds of messages, ns; a little less than 0.1 s, as timers jitter.
 PERIOD = 90_000_000
 #: Own states and sightings older than this, ns, or as far in the future, are not sent.
-STALE = 500_000_000
+STALE_AGE = 500_000_000
 DISORDER = to_nanoseconds(MAX_JUMP)  # ns by which an older state comes after a newer one
 OWN_FUTURE = 'own odometry from the future'
 START_YAW = 0.35  # rad: a linear filter needs a first yaw with at most this deviation
 SEEN_TIMEOUT = 500_000_000  # ns after an own sighting in which received states are not used
 FORGOTTEN = 30 * NANOSECONDS  # ns: a sender silent for so long is forgotten
-#: Most senders, and most vehicles that one vehicle sees, or reports.
-SENDERS_MAX, SEEN_MAX = 32, 40
+MAX_SENDERS = 32  # senders
+MAX_VEHICLES = 40  # vehicles that one vehicle sees, or reports
 #: A state that a vehicle sent of itself is replaced only by one with this share of its variance.
 OWN_STATE_SHARE = 0.5
-#: Own messages that may come back, and events that wait to be read.
-REMEMBERED, EVENTS = 100, 500
+MAX_ECHOES = 100  # own messages that may come back
+MAX_EVENTS = 500  # events that wait to be read
 #: One vehicle relates two frames once in this time, ns: errors of sightings are correlated.
 RELATING = 200_000_000
 
@@ -102,7 +102,7 @@ class Sharing:
         self._tracks: defaultdict[str, Track] = defaultdict(Track)
         self._last_round: int | None = None
         self._sent: dict[str, int] = {}
-        self._echoes: deque[tuple[float, ...]] = deque(maxlen=REMEMBERED)
+        self._echoes: deque[tuple[float, ...]] = deque(maxlen=MAX_ECHOES)
         self._events: list[tuple[str, str]] = []
 
     @property
@@ -117,7 +117,7 @@ class Sharing:
         """Take the own state, of any odometry."""
         self._settle()
         fast, before = too_fast(state), self._own
-        if self._refused((fast, 'own odometry not finite, or too fast', fast)):
+        if self._refuse_first((fast, 'own odometry not finite, or too fast', fast)):
             return
         if before is not None:
             back = before.stamp - state.stamp
@@ -126,7 +126,8 @@ class Sharing:
             leap = 'in time' if back > 0 else leapt(before, state)
             if before.frame != state.frame:
                 leap = f'from frame {before.frame!r} to {state.frame!r}'
-            if self._refused((leap, 'own odometry leapt', f'{leap}: all frames are aligned anew')):
+            if self._refuse_first(
+                    (leap, 'own odometry leapt', f'{leap}: all frames are aligned anew')):
                 self._seen.clear()
                 self._tracks.clear()
                 self._senders.clear()
@@ -140,15 +141,15 @@ class Sharing:
         frame = None if self._own is None else self._own.frame
         doubt = float(position_covariance(state, False).trace())
         # A duplicate of a marker is not a vehicle.
-        if DUPLICATE in name or self._refused(
+        if DUPLICATE in name or self._refuse_first(
                 (frame is None, 'sighting before own odometry', name),
                 (fast, 'unusable sighting', fast),
                 (name == self.name or state.frame != frame, 'unusable sighting',
                  f'{name!r} in frame {state.frame!r}, own odometry in {frame!r}')) or (
                      before is not None and 0 <= before.stamp - state.stamp <= DISORDER):
             return
-        if self._refused(
-                (before is None and len(self._seen) >= SEEN_MAX, 'too many vehicles', name),
+        if self._refuse_first(
+                (before is None and len(self._seen) >= MAX_VEHICLES, 'too many vehicles', name),
                 (not is_covariance(state.pose_covariance[:3, :3]), 'sighting without a covariance',
                  name),
                 # For a while only ranges to it are measured.
@@ -181,7 +182,7 @@ class Sharing:
         name = sender_of(state.frame)
         sender = self._senders.get(name)
         # An own message may come back.
-        if self._refused(
+        if self._refuse_first(
                 (not name, 'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
                  f'NAME{FRAME}, where NAME is the sending vehicle'),
                 (name == self.name and (state.stamp, *state.position) not in self._echoes,
@@ -190,13 +191,13 @@ class Sharing:
             return
         if refused := refusal(state, received):
             if refused[0] == FUTURE and sender is not None:
-                sender.ban = received + BAN, 'has a clock that is ahead'
+                sender.ban = received + BAN_TIME, 'has a clock that is ahead'
             self._refuse(*refused)
-        elif not self._refused((sender is None and len(self._senders) >= SENDERS_MAX,
+        elif not self._refuse_first((sender is None and len(self._senders) >= MAX_SENDERS,
                                 'too many senders', name)):
             sender = self._senders.setdefault(name, Sender(name))
             sender.received = received
-            if not self._refused((received < sender.ban[0], 'ignored for a while',
+            if not self._refuse_first((received < sender.ban[0], 'ignored for a while',
                                   f'{name} {sender.ban[1]}')):
                 self._take_from(sender, state, received)
 
@@ -204,9 +205,10 @@ class Sharing:
         """Take a valid message of a sender."""
         vehicle, of_itself = state.child, state.child == sender.name
         before, what = sender.states.get(vehicle), f'{sender.name} sends {vehicle}'
-        if self._refused(
+        if self._refuse_first(
                 (before is not None and state.stamp <= before.stamp, 'message out of order', what),
-                (before is None and len(sender.states) >= SEEN_MAX, 'too many vehicles', what)):
+                (before is None and len(sender.states) >= MAX_VEHICLES,
+                 'too many vehicles', what)):
             return
         leap = '' if before is None else leapt(before, state)
         if of_itself:
@@ -220,24 +222,26 @@ class Sharing:
         sender.ages.append((received - state.stamp) / NANOSECONDS)
         point = track_point(state, of_itself)
         sender.tracks[vehicle].add(point)
-        fits = self._relate(sender, vehicle, point, *self._known(vehicle, state.stamp, sender))
+        fits = self._relate(
+            sender, vehicle, point, *self._relating_point(vehicle, state.stamp, sender))
         if sender.frame is not None and not of_itself:
             self._relate_seen(vehicle, sender.frame.point(point), sender.hops + 1)
         sender.states[vehicle] = state
         if not fits or (leap and not of_itself):
             del sender.states[vehicle]  # the next state decides
         why = sender.unusable(received)
-        self._refused((why, f'not aligned with {sender.name}', why))
+        self._refuse_first((why, f'not aligned with {sender.name}', why))
 
     # Relations between frames.
 
-    def _known(self, vehicle: str, stamp: int, of: Sender) -> tuple[TrackPoint | None, float]:
+    def _relating_point(self, vehicle: str, stamp: int, of: Sender
+                        ) -> tuple[TrackPoint | None, float]:
         """
         Return a vehicle at a stamp in the own frame, and the hops of a relation by it.
 
         :param of: the sender to relate.
         """
-        point = self._tracks[vehicle].at(stamp) if vehicle in self._tracks else None
+        point = self._tracks[vehicle].point_at(stamp) if vehicle in self._tracks else None
         if point is not None:
             return point, 1
         for sender in sorted(self._senders.values(),
@@ -245,7 +249,7 @@ class Sharing:
             if sender.hops >= of.hops or sender.frame is None or sender.vague or (
                     vehicle not in sender.tracks):
                 continue
-            point = sender.tracks[vehicle].at(stamp)
+            point = sender.tracks[vehicle].point_at(stamp)
             if point is not None:
                 return sender.frame.point(point), sender.hops + 1
         return None, math.inf
@@ -253,7 +257,7 @@ class Sharing:
     def _relate_seen(self, name: str, ours: TrackPoint, hops: float) -> None:
         """Relate the frame of a vehicle that was seen: its own states are newer than an image."""
         if sender := self._senders.get(name):
-            self._relate(sender, name, sender.tracks[name].at(ours.stamp), ours, hops)
+            self._relate(sender, name, sender.tracks[name].point_at(ours.stamp), ours, hops)
 
     def _relate(self, sender: Sender, vehicle: str, theirs: TrackPoint | None,
                 ours: TrackPoint | None, hops: float) -> bool:
@@ -273,8 +277,8 @@ class Sharing:
             return True
         sender.refused += 1
         self._refuse('does not fit the alignment', f'{sender.name}: {doubt:.1f} times the gate')
-        if sender.refused >= WRONG:
-            self._align_anew(sender, f'{WRONG} times in a row it did not fit')
+        if sender.refused >= REALIGN_REFUSALS:
+            self._align_anew(sender, f'{REALIGN_REFUSALS} times in a row it did not fit')
         return False
 
     def _begin(self, sender: Sender, theirs: TrackPoint, ours: TrackPoint, hops: float) -> None:
@@ -283,11 +287,11 @@ class Sharing:
         while pairs and theirs.stamp - pairs[0][0].stamp > PAIR_AGE_MAX:
             pairs.popleft()
         pairs.append((theirs, ours))
-        if len(pairs) < FEWEST:
+        if len(pairs) < MIN_PAIRS:
             return
         frame = first_fit(pairs)
         if frame is None:
-            if len(pairs) > 4 * FEWEST:  # the older ones may be wrong
+            if len(pairs) > 4 * MIN_PAIRS:  # the older ones may be wrong
                 for _ in range(len(pairs) // 2):
                     pairs.popleft()
             return
@@ -311,16 +315,16 @@ class Sharing:
     def messages(self, now: int) -> list[OdometryState]:
         """Return the messages to send: the own state and sightings, each once, at most 10 Hz."""
         own, name = self._own, self.name
-        if own is None or now - own.stamp > STALE or (
+        if own is None or now - own.stamp > STALE_AGE or (
                 self._last_round is not None and 0 <= now - self._last_round < PERIOD):
             return []
         self._last_round = now
-        if own.stamp - now > STALE:
+        if own.stamp - now > STALE_AGE:
             self._refuse(OWN_FUTURE, f'by {(own.stamp - now) / NANOSECONDS:.3g} s')
             return []
         messages = [state._replace(frame=name + FRAME)
                     for state in (own._replace(child=name), *in_order(self._seen))
-                    if abs(now - state.stamp) <= STALE
+                    if abs(now - state.stamp) <= STALE_AGE
                     and state.stamp != self._sent.get(state.child)]
         for message in messages:
             self._sent[message.child] = message.stamp
@@ -355,14 +359,15 @@ class Sharing:
                 of_itself = name == sender.name
                 placed = in_own_frame(state, of_itself, frame, own.frame)
                 doubt = float(placed.pose_covariance[:3, :3].trace())
-                if self._refused((doubt > POSITION_STD_MAX ** 2, 'received position too uncertain',
-                                  f'{name} by {sender.name}: {math.sqrt(doubt):.2f} m')):
+                if self._refuse_first((
+                        doubt > POSITION_STD_MAX ** 2, 'received position too uncertain',
+                        f'{name} by {sender.name}: {math.sqrt(doubt):.2f} m')):
                     continue
                 doubt = (doubt + 0.75 * (ACCELERATION_STD * age ** 2) ** 2) * (
                     OWN_STATE_SHARE if of_itself else 1.0)
                 if name not in surest or doubt < surest[name][0]:
                     surest[name] = doubt, placed
-        return [aged(state, now) for _, state in in_order(surest)]
+        return [age_covariances(state, now) for _, state in in_order(surest)]
 
     def new_events(self) -> list[tuple[str, str]]:
         """Return the refusals since the last call."""
@@ -372,9 +377,9 @@ class Sharing:
 
     def why_silent(self, now: int) -> str:
         """Return why no received message can be used, or ''."""
-        if self._own is None or now - self._own.stamp > STALE:
+        if self._own is None or now - self._own.stamp > STALE_AGE:
             return 'no own odometry'
-        if self._own.stamp - now > STALE:
+        if self._own.stamp - now > STALE_AGE:
             return OWN_FUTURE
         active = {name: sender.unusable(now) for name, sender in sorted(self.senders.items())
                   if now - sender.received <= to_nanoseconds(MESSAGE_AGE_MAX)}
@@ -383,7 +388,7 @@ class Sharing:
         return '; '.join(f'not aligned with {name}: {why}' for name, why in active.items()
                          ) if all(active.values()) else ''
 
-    def _refused(self, *cases: tuple[object, str, str]) -> bool:
+    def _refuse_first(self, *cases: tuple[object, str, str]) -> bool:
         """
         Report the first case that holds; return whether one does.
 
@@ -396,5 +401,5 @@ class Sharing:
         return False
 
     def _refuse(self, reason: str, detail: str) -> None:
-        if len(self._events) < EVENTS:
+        if len(self._events) < MAX_EVENTS:
             self._events.append((reason, detail))

@@ -19,7 +19,7 @@ An edge joins two vehicles if no third one is nearer to both than they are to ea
 relative neighborhood graph (Toussaint, Pattern Recognition 12, 1980). This graph contains the
 minimum spanning tree, so it is connected. Both ends compute the same edge if they know the same
 positions. The graph has few edges, each about as long as the spacing of the flock. An edge is
-removed only if a third vehicle is nearer to both ends by the factor HELD: every graph in between
+removed only if a third vehicle is nearer to both ends by HELD_FACTOR: every graph in between
 is connected as well.
 """
 
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from flock_follower.flocking import alignment, cohesion, disagreement, FlockingParams, separation
 from flock_follower.geometry import Array
 
-HELD = 1.15  # factor of distance by which a third vehicle must be nearer to remove an edge
+HELD_FACTOR = 1.15  # factor of distance by which a third vehicle must be nearer to remove an edge
 _FADE = 0.28  # share of the band, from d0, up to which vehicles without an edge separate fully
 #: sin(pi y) / y by the powers of y^2, to 1e-13 up to y = 0.5; numpy's cosine takes twice as long.
 _SINE = (3.141592653589635, -5.167712779988027, 2.5501640359098254, -0.5992644339893498,
@@ -58,7 +58,7 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     others = np.maximum(_lengths(positions[:, None] - positions) - between, 0.0)
     np.fill_diagonal(others, math.inf)
     nearer = np.maximum(own[:, None], others).min(axis=0)  # of all, to the farther end
-    joined: NDArray[np.bool_] = own <= np.where(held, HELD, 1.0) * nearer
+    joined: NDArray[np.bool_] = own <= np.where(held, HELD_FACTOR, 1.0) * nearer
     return joined
 
 

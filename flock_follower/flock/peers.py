@@ -115,25 +115,26 @@ def in_order(by_name: dict[str, Kept]) -> list[Kept]:
     return [by_name[name] for name in sorted(by_name)]
 
 
-#: Odometry that is further from its prediction than ``ODOMETRY_JUMP``, or this, rad, has leapt ...
-TURN = 0.4
-#: ... plus the motion of these, m/s^2 and rad/s, since its last message. After PREDICTABLE, s, no
-#: prediction is possible.
-PUSH, SPIN, PREDICTABLE = 3.0, 2.0, 3.0
+# Odometry has leapt if it is farther from its prediction than ODOMETRY_JUMP or TURN, plus the
+# motion by MAX_PUSH and MAX_SPIN since its last message.
+TURN = 0.4  # rad
+MAX_PUSH = 3.0  # m/s^2
+MAX_SPIN = 2.0  # rad/s
+PREDICTION_TIME = 3.0  # s after its last message without which no prediction is possible
 
 
 def leapt(before: OdometryState, now: OdometryState) -> str:
     """Return the leap of an odometry between two of its states, as text, or ''."""
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
-    if not 0.0 <= elapsed <= PREDICTABLE:
+    if not 0.0 <= elapsed <= PREDICTION_TIME:
         return ''
     expected = before.position + 0.5 * elapsed * (before.velocity + now.velocity)
     off = math.dist(expected, now.position)
     turn = abs(wrap_angle(yaw_from_quaternion(now.quaternion)
                           - yaw_from_quaternion(before.quaternion)))
-    if off > ODOMETRY_JUMP + 0.5 * PUSH * elapsed ** 2:
+    if off > ODOMETRY_JUMP + 0.5 * MAX_PUSH * elapsed ** 2:
         return f'by {off:.2f} m'
-    return f'by {turn:.2f} rad' if turn > TURN + SPIN * elapsed else ''
+    return f'by {turn:.2f} rad' if turn > TURN + MAX_SPIN * elapsed else ''
 
 
 class TrackPoint(NamedTuple):
@@ -200,11 +201,11 @@ class Track:
             points.pop()
         points.append(point)
         if points[0].stamp < point.stamp - HORIZON:
-            del points[:self._first(point.stamp - HORIZON // 2)]
+            del points[:self._first_index(point.stamp - HORIZON // 2)]
 
-    def at(self, stamp: int) -> TrackPoint | None:
+    def point_at(self, stamp: int) -> TrackPoint | None:
         """Return the vehicle at a stamp, ns, or None if that is unknown."""
-        k = self._first(stamp)
+        k = self._first_index(stamp)
         if k == len(self._points):
             if not k or stamp - self._points[-1].stamp > REACH:
                 return None
@@ -217,14 +218,14 @@ class Track:
             return after
         if k == 0 or after.stamp - self._points[k - 1].stamp > INTERPOLATED:
             return None
-        return _between(self._points[k - 1], after, stamp)
+        return _interpolate(self._points[k - 1], after, stamp)
 
-    def _first(self, stamp: int) -> int:
+    def _first_index(self, stamp: int) -> int:
         """Return the index of the first point at or after a stamp."""
         return bisect_left(self._points, stamp, key=attrgetter('stamp'))
 
 
-def _between(before: TrackPoint, after: TrackPoint, stamp: int) -> TrackPoint:
+def _interpolate(before: TrackPoint, after: TrackPoint, stamp: int) -> TrackPoint:
     """Return the point between two: a cubic through both positions, with both velocities."""
     gap = (after.stamp - before.stamp) / NANOSECONDS
     f = (stamp - before.stamp) / (after.stamp - before.stamp)
@@ -239,7 +240,7 @@ def _between(before: TrackPoint, after: TrackPoint, stamp: int) -> TrackPoint:
         max(before.yaw_variance, after.yaw_variance))
 
 
-def aged(state: OdometryState, now: int) -> OdometryState:
+def age_covariances(state: OdometryState, now: int) -> OdometryState:
     """
     Return a state with the covariances of its prediction to a time, ns.
 

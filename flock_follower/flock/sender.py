@@ -20,20 +20,19 @@ from collections import defaultdict, deque
 from dataclasses import dataclass, field
 import math
 
-from flock_follower.flock.alignment import Frame, MOST, Pair
+from flock_follower.flock.alignment import Frame, MAX_PAIRS, Pair
 from flock_follower.flock.peers import Track
 from flock_follower.messages import NANOSECONDS, OdometryState, POSITION_STD_MAX
 
 YAW_STD_MAX = 0.1  # rad: a frame with a larger standard deviation of the yaw is not used
-#: Relations refused in a row: from DOUBTED on the sender is not used, from WRONG on its frame is
-#: aligned anew.
-DOUBTED, WRONG = 2, 5
-#: A sender whose stamps are wrong is ignored for this time, ns.
-BAN = 5 * NANOSECONDS
-#: This many own states within this time, ns, come from two senders: one sends at 10 Hz.
-OFTEN, TOO_SHORT = 20, 1_400_000_000
-#: Messages whose ages are kept, and the least age, s, that is reported.
-AGES, SLOW = 50, 0.25
+DOUBT_REFUSALS = 2  # relations refused in a row after which the sender is not used
+REALIGN_REFUSALS = 5  # relations refused in a row after which its frame is aligned anew
+BAN_TIME = 5 * NANOSECONDS  # ns for which a sender whose stamps are wrong is ignored
+# One sender sends at 10 Hz: more own states in a time come from two senders.
+BURST_COUNT = 20  # own states of two senders
+BURST_TIME = 1_400_000_000  # ns in which two senders send so many
+MAX_AGES = 50  # messages whose ages are kept
+SLOW_LINK = 0.25  # s: the least age that is reported
 
 
 @dataclass
@@ -48,7 +47,7 @@ class Sender:
     """Estimate of its frame; None while it is not known."""
     hops: float = math.inf
     """1 if its frame is related to the own one directly, 2 by one other sender, ..."""
-    pairs: deque[Pair] = field(default_factory=lambda: deque(maxlen=MOST))
+    pairs: deque[Pair] = field(default_factory=lambda: deque(maxlen=MAX_PAIRS))
     """Relations until the first fit."""
     yaw_std: float = math.pi
     """Standard deviation of the yaw of its frame, rad, at the last fit."""
@@ -58,9 +57,9 @@ class Sender:
     """Relations refused in a row."""
     received: int = 0
     """When its last message was received, ns."""
-    ages: deque[float] = field(default_factory=lambda: deque(maxlen=AGES))
+    ages: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_AGES))
     """Ages of its last messages on reception, s."""
-    sent: deque[int] = field(default_factory=lambda: deque(maxlen=OFTEN))
+    sent: deque[int] = field(default_factory=lambda: deque(maxlen=BURST_COUNT))
     """Stamps of the last states of itself, ns."""
     ban: tuple[int, str] = (0, '')
     """Until when, ns, and why it is ignored."""
@@ -68,8 +67,8 @@ class Sender:
     def sent_at(self, stamp: int, received: int) -> None:
         """Note the stamp of a state of itself; a sender that sends too often is ignored."""
         self.sent.append(stamp)
-        if len(self.sent) == OFTEN and stamp - self.sent[0] < TOO_SHORT:
-            self.ban = received + BAN, f'sends {OFTEN} times in {TOO_SHORT / 1e9:g} s'
+        if len(self.sent) == BURST_COUNT and stamp - self.sent[0] < BURST_TIME:
+            self.ban = received + BAN_TIME, f'sends {BURST_COUNT} times in {BURST_TIME / 1e9:g} s'
             self.sent.clear()
 
     @property
@@ -87,7 +86,7 @@ class Sender:
         if self.frame is None:
             return ('neither sees the other, nor do both see one vehicle' if not self.pairs else
                     f'its yaw is known to {self.yaw_std:.1f} rad: a vehicle must move')
-        if self.refused >= DOUBTED:
+        if self.refused >= DOUBT_REFUSALS:
             return f'{self.refused} times in a row it did not fit'
         return 'its frame is known to {:.2f} m and {:.2f} rad, limits {:g} m and {:g} rad'.format(
             *self.frame.stds, POSITION_STD_MAX, YAW_STD_MAX) if self.vague else ''
@@ -96,5 +95,5 @@ class Sender:
     def slow(self) -> str:
         """Return a warning if all of its last messages were old on reception, or ''."""
         least = min(self.ages, default=0.0)
-        return '' if least < SLOW else (
+        return '' if least < SLOW_LINK else (
             f'messages are {least:.2f} s old or more: a slow way, or its clock is behind')

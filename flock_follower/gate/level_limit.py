@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import math
 
 from flock_follower.geometry import Array
-from flock_follower.planner.limits import INSIDE, limit_command, SENT_INSIDE
+from flock_follower.planner.limits import INSIDE_SHARE, limit_command, SENT_INSIDE
 from flock_follower.planner.projection import Discs, lexicographic, Side
 
 
@@ -33,7 +33,7 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     is the nearest one to that of ``a`` in the discs that this level cuts out of the limits and,
     in their order, within bounds of the plane.
     """
-    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
+    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
     strongest, reach, center = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()
     side = Discs(0j, strongest, complex(center[2], math.hypot(*center[:2])), reach)
     up = min(max(up, side.best(-1 + 0j, far=True).real), side.best(1 + 0j, far=True).real)

@@ -55,7 +55,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
-    INSIDE,
+    INSIDE_SHARE,
     limit_command,
     limit_norm,
     LimitedCommand,
@@ -239,7 +239,7 @@ def _with_offset(acceleration: Array, offset: Array, a_max: float, axis: Array |
     """
     strongest = a_max * SENT_INSIDE
     total = acceleration + offset
-    if math.hypot(*total.tolist()) <= strongest * INSIDE:
+    if math.hypot(*total.tolist()) <= strongest * INSIDE_SHARE:
         return total
     up = min(max(float(total[2]), -strongest), strongest)
     rest = math.sqrt(max(strongest ** 2 - up ** 2, 0.0))

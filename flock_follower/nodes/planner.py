@@ -148,7 +148,7 @@ class Planner(FlockNode):
 
     def _flying(self) -> bool:
         """Return whether the bridge is ACTIVE; if none is required, whether it is engaged."""
-        return not self._loop.waiting(self._bridge_age()) and (
+        return not self._loop.waiting_reason(self._bridge_age()) and (
             self._settings.values['require_bridge'] or self._loop.engaged)
 
     def _poll_states(self, kind: Any, topic: str, convert: Callable[[Any], Any],
@@ -230,7 +230,7 @@ class Planner(FlockNode):
         fault = self._loop.odometry_fault(self._even_clock.now(), self._settings.current)
         return [*filter(None, [
             f'{fault} on {self.resolve_topic_name("odom")}' if fault else '',
-            self._loop.waiting(self._bridge_age()),
+            self._loop.waiting_reason(self._bridge_age()),
             '' if self._loop.memory.neighbors else 'no neighbor seen yet'])]
 
     def _tick(self) -> None:

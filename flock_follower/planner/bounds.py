@@ -62,10 +62,10 @@ import numpy as np
 from flock_follower.geometry import GRAVITY, SHORTEST, wrap_angle
 from flock_follower.messages import SANE
 from flock_follower.planner.inputs import (
-    Expected,
-    expected,
     Neighbor,
     OwnState,
+    predict,
+    Prediction,
 )
 from flock_follower.planner.limits import (
     Bound,
@@ -85,35 +85,37 @@ from flock_follower.planner.params import (
     Member,
     PlannerParams,
 )
-from flock_follower.planner.sight import MARGIN, vertical, View
-from flock_follower.planner.vertical_yaw import OVERHEAD
+from flock_follower.planner.sight import IMAGE_MARGIN, vertical, View
+from flock_follower.planner.vertical_yaw import OVERHEAD_DISTANCE
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
-DOWNWASH = 0.9  # least horizontal distance at any height, as a share of sqrt(d0)
+DOWNWASH_SHARE = 0.9  # least horizontal distance at any height, as a share of sqrt(d0)
 ALIKE = 0.35  # share of the horizontal distance: with less height between, the distance suffices
-DEVIATIONS = 2.0  # standard deviations of a measured distance, if only that is known ...
-BLIND = 0.3  # m: ... and the extra distance: when seen again, v_max goes into its altitude first
+DEVIATIONS = 2.0  # standard deviations of a measured distance, if only that is known
+# When the neighbor is seen again, v_max goes into its altitude first.
+DISTANCE_ONLY_MARGIN = 0.3  # m of extra distance if only the distance is known
 STOP_SHARE = 0.6  # of a_max: deceleration of the stop before a place that was not seen free
 TURNING_SHARE = 0.8  # of yaw_rate_max, to follow a neighbor that passes
 TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
 MARKER_ANGLE = math.radians(60.0)  # largest angle between a marker's normal and the line of sight
-IN_LINE = math.radians(30.0)  # the same behind a follower: a column that is pushed back buckles
-MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each metre of arc that is left ...
-MARKER_SHARE = 0.3  # of v_max: ... and the speed with which a larger angle is reduced
-STILL = 0.0, 0.0, 0.0
+# A column that is pushed back buckles.
+COLUMN_ANGLE = math.radians(30.0)  # largest angle to the marker's normal behind a follower
+MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each meter of arc that is left
+MARKER_SHARE = 0.3  # of v_max: speed with which an angle beyond the largest is reduced
+ZERO_VECTOR = 0.0, 0.0, 0.0  # m/s, or m/s^2
 
 
 def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], edges: Edges,
-                  params: GuardParams, neighbor_acceleration: Sequence[float] = STILL,
-                  seen: bool = True, velocity: Sequence[float] = STILL) -> list[Bound]:
+                  params: GuardParams, neighbor_acceleration: Sequence[float] = ZERO_VECTOR,
+                  seen: bool = True, velocity: Sequence[float] = ZERO_VECTOR) -> list[Bound]:
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
     Without a direction, or with a value that is not finite, the list is empty.
 
-    :param offset: own position minus the neighbour's, (3,), m.
-    :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
-    :param neighbor_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
+    :param offset: own position minus the neighbor's, (3,), m.
+    :param relative_velocity: own velocity minus the neighbor's, (3,), m/s.
+    :param neighbor_acceleration: a_L, the neighbor's, as far as it is known, (3,), m/s^2.
     :param seen: the neighbor is in sight.
     :param velocity: own velocity (3,), m/s; of influence only with a headway.
     """
@@ -129,20 +131,20 @@ def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], e
     away = scalar_product(n, velocity)
     gap = distance - edges.near - edges.margin - edges.spread - edges.headway * max(
         edges.fastest - away, 0.0)
-    speed, slope = params.closing(gap)
+    speed, slope = params.closing_speed(gap)
     lowest = common - (closing + speed) / params.T_g - slope * closing
     if edges.headway > 0.0:
         turned = (scalar_product(w, velocity) - rate * away) / distance
         lowest = (lowest - slope * edges.headway * turned) / (1.0 + slope * edges.headway)
     bounds = [Bound(n, lowest, SEPARATION, distance, seen)]
     if math.isfinite(edges.far):
-        speed, slope = params.closing(edges.far - edges.margin - distance)
+        speed, slope = params.closing_speed(edges.far - edges.margin - distance)
         highest = common - (rate - speed) / params.T_g - slope * rate
         bounds.append(Bound(opposite(n), -highest, COHESION, distance, seen))
     return bounds
 
 
-def in_sight(it: Expected, position: Sequence[float], velocity: Sequence[float], seen: bool,
+def in_sight(it: Prediction, position: Sequence[float], velocity: Sequence[float], seen: bool,
              followed: bool, params: PlannerParams, radii: float = 0.0, headway: float = 0.0
              ) -> list[Bound]:
     """
@@ -162,7 +164,8 @@ def in_sight(it: Expected, position: Sequence[float], velocity: Sequence[float],
     bounds = radial_bounds(offset, rate, band, params.guarding, it.acceleration,
                            velocity=velocity) if seen else []
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
-        level = band._replace(near=(DOWNWASH if seen else 1.0) * inner.near + radii, far=math.inf)
+        near = (DOWNWASH_SHARE if seen else 1.0) * inner.near + radii
+        level = band._replace(near=near, far=math.inf)
         bounds += radial_bounds(
             horizontal(offset), horizontal(rate), level, params.guarding,
             horizontal(it.acceleration), seen, horizontal(velocity))
@@ -174,7 +177,7 @@ def stop(along: Sequence[float], left: float, velocity: Sequence[float],
     """Return the bound that stops the vehicle along a unit vector within ``left`` m."""
     guarding, rate = params.guarding, scalar_product(along, velocity)
     # Until the command acts the vehicle keeps its velocity.
-    speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,
+    speed, slope = guarding.closing_speed(left - max(rate, 0.0) * params.response_time,
                                     max(guarding.b, STOP_SHARE * params.strongest))
     return Bound(
         opposite(along), (rate - max(speed, 0.0)) / guarding.T_g + slope * max(rate, 0.0), FENCE)
@@ -188,8 +191,8 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     :param known: the last estimate of its position; None without one.
     :param velocity: own velocity when the command acts (3,), m/s.
     """
-    acceleration = STILL if n.acceleration is None else n.acceleration.tolist()
-    it = expected(n, acceleration, me.stamp - n.stamp, params)
+    acceleration = ZERO_VECTOR if n.acceleration is None else n.acceleration.tolist()
+    it = predict(n, acceleration, me.stamp - n.stamp, params)
     sight = np.subtract(it.position, me.position)
     distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
     if not level > SHORTEST:
@@ -208,13 +211,13 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     inner = params.edges
     band = inner._replace(
         near=inner.near + params.radius + n.member.radius, far=math.inf, spreading=it.spreading,
-        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))
+        spread=it.spread + DISTANCE_ONLY_MARGIN + DEVIATIONS * math.sqrt(max(variance, 0.0)))
     return radial_bounds((-distance * towards).tolist(), (-rate * towards).tolist(), band,
                          params.guarding, (float(along @ it.acceleration) * towards).tolist(),
                          sure)
 
 
-def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Expected, yaw: float,
+def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Prediction, yaw: float,
                  view: View, params: PlannerParams) -> list[Bound]:
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
@@ -230,14 +233,14 @@ def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Expecte
     """
     x, y, z = offset
     distance = math.hypot(x, y)
-    if distance < OVERHEAD:
+    if distance < OVERHEAD_DISTANCE:
         return []
     up, down = vertical(view, math.atan2(y, x) - yaw)
     forward = [x / distance, y / distance, 0.0]
     slope = z / distance
     # Its height alone never forces a horizontal motion: altitude control follows its height.
-    faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
-    slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
+    faster = max(GRAVITY * (math.tan(max(up - IMAGE_MARGIN, 0.0)) - slope), 0.0)
+    slower = max(GRAVITY * (math.tan(max(down - IMAGE_MARGIN, 0.0)) + slope), 0.0)
     left = [-y / distance, x / distance, 0.0]
     passing = scalar_product(left, difference(it.velocity, velocity))
     turning = TURNING_SHARE * params.yaw_rate_max * distance
@@ -247,26 +250,26 @@ def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Expecte
             Bound(opposite(left), (-passing - turning) / TURNING_TIME - across, SIGHT)]
 
 
-def marker_bounds(offset: Sequence[float], velocity: Sequence[float], it: Expected, yaw: float,
+def marker_bounds(offset: Sequence[float], velocity: Sequence[float], it: Prediction, yaw: float,
                   member: Member, params: PlannerParams) -> list[Bound]:
     """
-    Return the bounds on the viewing angle of a neighbour's marker.
+    Return the bounds on the viewing angle of a neighbor's marker.
 
     It is the angle between the line of sight and the marker's normal: at most MARKER_ANGLE, and
-    IN_LINE behind a follower. The vehicle moves round the neighbour; the arguments are those of
-    ``sight_bounds``.
+    COLUMN_ANGLE behind a follower. The vehicle moves round the neighbor; the arguments are those
+    of ``sight_bounds``.
 
-    :param yaw: the neighbour's, rad.
+    :param yaw: the neighbor's, rad.
     """
     x, y, _ = offset
     distance = math.hypot(x, y)
-    if distance < OVERHEAD or not member.faces:  # without a marker it has no angle
+    if distance < OVERHEAD_DISTANCE or not member.faces:  # without a marker it has no angle
         return []
     there = math.atan2(-y, -x)
     off = min((wrap_angle(there - yaw - face) for face in member.faces), key=abs)
     side = math.copysign(1.0, off)
     outward = [side * y / distance, -side * x / distance, 0.0]
-    widest = IN_LINE if member.role == FOLLOWER else MARKER_ANGLE
+    widest = COLUMN_ANGLE if member.role == FOLLOWER else MARKER_ANGLE
     left = (widest - abs(off)) * distance
     fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
     rate = scalar_product(outward, difference(velocity, it.velocity))

@@ -34,59 +34,60 @@ from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bounds import (
     clear_of_sphere,
-    DOWNWASH,
+    DOWNWASH_SHARE,
     in_sight,
     marker_bounds,
     sight_bounds,
-    STILL,
     stop,
     STOP_SHARE,
+    ZERO_VECTOR,
 )
 from flock_follower.planner.inputs import (
-    Expected,
-    expected,
+    MAX_ACCELERATION_AGE,
     Neighbor,
     OwnState,
-    SEEN,
+    predict,
+    Prediction,
 )
 from flock_follower.planner.limits import (
     Bound,
     COHESION,
-    constrained,
     difference,
     FENCE,
+    keep_bounds,
     limit_command,
     limit_horizontal,
     LimitedCommand,
     scalar_product,
     SEPARATION,
 )
-from flock_follower.planner.memory import longest, Loss, Memory
+from flock_follower.planner.memory import Loss, max_age, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
-from flock_follower.planner.scene import Scene, silent, SURE
+from flock_follower.planner.scene import RECEIVED_SIGMAS, Scene, silent
 from flock_follower.planner.sight import View
 
-LEVEL = np.array([1.0, 1.0, 0.0])
+HORIZONTAL_AXES = np.array([1.0, 1.0, 0.0])  # factors of x, y, z
+
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backing off
 DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
 UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
-YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than these ...
-YIELD_MAX = 3.0  # m: ... but by no more than this
-SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
-BESIDE = 0.3  # ... unless it is on that side by this share of the distance
+YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer
+YIELD_MAX = 3.0  # m by which the retreat is longer at most
+SIDESTEP_WEIGHT = 2.0  # of the step aside, at the end of the retreat; 1.0 is that straight away
+SIDESTEP_DEADZONE = 0.3  # share of the distance: no step aside to a neighbor so far on that side
 FAILING_TIME = 0.5  # s that a follower whose computer failed flies on before it stops and hovers
 COVER_WIDTH = 0.8  # m off the line of sight up to which one in sight covers another
-CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is left ...
-OVERFLIGHT_CLIMB = 1.0  # m: ... upwards, by this height
-HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
+CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is overflown
+OVERFLIGHT_CLIMB = 1.0  # m of climb above a neighbor that is overflown
+MAX_HEIGHT_ABOVE = 0.3  # m: a neighbor that is higher than the vehicle by more is not overflown
 
 
-def ordered(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
-            sight: Sequence[Bound] = ()) -> list[Bound]:
+def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
+                sight: Sequence[Bound] = ()) -> list[Bound]:
     """
     Return all bounds in the order of their importance.
 
@@ -118,9 +119,9 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
         x, y, z = difference(n.position.tolist(), here)
         vx, vy, climb = n.velocity.tolist()
         level = math.hypot(x, y)
-        if level < DOWNWASH * near:
+        if level < DOWNWASH_SHARE * near:
             gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
-            speed = min(params.guarding.closing(gap)[0], 0.0)
+            speed = min(params.guarding.closing_speed(gap)[0], 0.0)
             if z > 0.0:
                 most = min(most, climb + speed)
             else:
@@ -130,8 +131,8 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
         approach = -(x * vx + y * vy) / max(level, SHORTEST)
         vx, vy, _ = me.velocity.tolist()
         leaving = -(x * vx + y * vy) / max(level, SHORTEST)
-        needed = approach - params.guarding.closing(level - near - edges.margin)[0]
-        beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
+        needed = approach - params.guarding.closing_speed(level - near - edges.margin)[0]
+        beneath = level < DOWNWASH_SHARE * near and approach <= APPROACH_NOISE
         leaving = 0.0 if beneath else max(approach, needed, leaving if needed > 0.0 else 0.0)
         if leaving > APPROACH_NOISE:
             rest = min(rest, math.sqrt(max(params.fastest ** 2 - leaving ** 2, 0.0)))
@@ -147,7 +148,7 @@ def fences(lost: Loss | None, position: Array, velocity: Array,
     # The full m in a narrow band, too: nothing beyond the last line of sight was seen free.
     left = lost.free - params.guarding.m - float(lost.towards @ position)
     onward = stop(lost.towards.tolist(), left, velocity.tolist(), params)
-    offset = LEVEL * (position - lost.origin)
+    offset = HORIZONTAL_AXES * (position - lost.origin)
     distance = math.hypot(*offset.tolist())
     if distance <= SHORTEST:
         return [onward]
@@ -155,20 +156,20 @@ def fences(lost: Loss | None, position: Array, velocity: Array,
     return [stop((offset / distance).tolist(), left, velocity.tolist(), params), onward]
 
 
-def retreating(bound: Bound, lost: Loss, position: Array, velocity: Sequence[float],
-               params: PlannerParams, sideways: bool = True) -> Bound:
+def limit_to_retreat(bound: Bound, lost: Loss, position: Array, velocity: Sequence[float],
+                     params: PlannerParams, sideways: bool = True) -> Bound:
     """
     Return the bound of one out of sight, limited to the retreat.
 
     :param sideways: whether it is the lost neighbor itself: the vehicle leaves its path.
     """
-    far, offset = retreat(lost, params), LEVEL * (position - lost.origin)
+    far, offset = retreat(lost, params), HORIZONTAL_AXES * (position - lost.origin)
     direction = np.array(bound.normal)
     # Not towards a neighbor that has moved to that side.
-    sideways = sideways and float(direction @ lost.side) > -BESIDE
+    sideways = sideways and float(direction @ lost.side) > -SIDESTEP_DEADZONE
     if sideways and lost.approach > APPROACH_NOISE and far > 0.0:
-        direction = LEVEL * direction + (
-            SIDEWAYS * min(lost.retreated(position) / far, 1.0) * lost.side)
+        direction = HORIZONTAL_AXES * direction + (
+            SIDESTEP_WEIGHT * min(lost.retreat_distance(position) / far, 1.0) * lost.side)
         direction = direction / max(math.hypot(*direction.tolist()), SHORTEST)
     along = float(direction @ offset)
     left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
@@ -207,9 +208,9 @@ def retreat_velocity(memory: Memory, scene: Scene, params: PlannerParams) -> Arr
         return None
     coming, position = list[tuple[float, float, list[float]]](), scene.me.position.tolist()
     for n in memory.flock.values():
-        if scene.me.stamp - n.stamp > longest(n, params):
+        if scene.me.stamp - n.stamp > max_age(n, params):
             continue
-        it = scene.expected[n.name]
+        it = scene.predictions[n.name]
         x, y, _ = difference(position, it.position)
         distance = math.hypot(x, y)
         length = max(distance, SHORTEST)
@@ -221,7 +222,7 @@ def retreat_velocity(memory: Memory, scene: Scene, params: PlannerParams) -> Arr
         return None
     gap, approach, away = min(coming, key=lambda each: each[:2])
     gap -= params.edges.near
-    speed = approach - min(params.guarding.closing(gap - params.edges.margin)[0], 0.0)
+    speed = approach - min(params.guarding.closing_speed(gap - params.edges.margin)[0], 0.0)
     speed = min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP)
     return speed * np.array(away)
 
@@ -235,10 +236,10 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
 
     :param held: altitude to hold, m.
     """
-    left = retreat(lost, params) - lost.retreated(position)
+    left = retreat(lost, params) - lost.retreat_distance(position)
     overtaken = lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
     if (params.altitude_max >= PlannerParams.altitude_max or params.retreat_max == 0.0
-            or not overtaken or lost.height > float(lost.origin[2]) + HIGHER):
+            or not overtaken or lost.height > float(lost.origin[2]) + MAX_HEIGHT_ABOVE):
         return -math.inf
     return held + OVERFLIGHT_CLIMB
 
@@ -261,10 +262,10 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
                                params.period, rising)
     if params.guard and (scene.state is not State.SEARCH or memory.flock):
         bounds = _bounds(memory, scene, velocity, view, params)
-        allowed = constrained(command.acceleration, velocity, bounds, params.a_max,
+        allowed = keep_bounds(command.acceleration, velocity, bounds, params.a_max,
                               params.v_max + more, params.period)
         if start != lowered:
-            clear = constrained(allowed.acceleration, velocity, [
+            clear = keep_bounds(allowed.acceleration, velocity, [
                 each for each in bounds if each.reason in (SEPARATION, FENCE)],
                 params.strongest, params.fastest + more, params.period)
             allowed = clear if clear.reason else allowed
@@ -303,11 +304,11 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
         here = name in memory.neighbors
         if here or not (name in memory.ranged or (scene.blinded and not n.received)):
             near += _neighbor_bounds(n, memory, scene, moving, here, params)
-    return ordered(near, fences(memory.lost, me.position, velocity, params),
+    return sort_bounds(near, fences(memory.lost, me.position, velocity, params),
                    _sight_bounds(memory, scene, moving, view, params))
 
 
-def _covered(it: Expected, scene: Scene) -> bool:
+def _is_covered(it: Prediction, scene: Scene) -> bool:
     """
     Return whether a lost neighbor is expected behind one in sight, on the line of sight.
 
@@ -332,11 +333,11 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
     has_failed = silent(n, me.stamp, params)
-    places = [_hovering(n, params) if has_failed else scene.expected[n.name]]
-    if age > SEEN and not n.received:  # its acceleration is a guess: never chase
-        places.append(expected(n, STILL, age, params))
+    places = [_hover_place(n, params) if has_failed else scene.predictions[n.name]]
+    if age > MAX_ACCELERATION_AGE and not n.received:  # its acceleration is a guess: never chase
+        places.append(predict(n, ZERO_VECTOR, age, params))
     if not (here or n.received):
-        places = [it._replace(spread=0.0, spreading=0.0) if _covered(it, scene) else it
+        places = [it._replace(spread=0.0, spreading=0.0) if _is_covered(it, scene) else it
                   for it in places]
     # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
     headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
@@ -345,25 +346,25 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
         found += in_sight(place, me.position.tolist(), velocity, seen,
                           joined and place is places[-1], params, radii_sum, headway)
     if memory.lost is not None and not (seen or n.received):
-        found = [retreating(each, memory.lost, me.position, velocity, params,
+        found = [limit_to_retreat(each, memory.lost, me.position, velocity, params,
                             n.name == memory.lost.name) for each in found]
     if has_failed:
-        found += [each._replace(normal=_aside(each.normal)) for each in found]
+        found += [each._replace(normal=_pass_beside(each.normal)) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
     return [each._replace(seen=False) for each in found] if n.received else found
 
 
-def _hovering(n: Neighbor, params: PlannerParams) -> Expected:
+def _hover_place(n: Neighbor, params: PlannerParams) -> Prediction:
     """Return the place where a follower that fell silent hovers, if its computer has failed."""
     along = n.velocity / max(math.hypot(*n.velocity.tolist()), SHORTEST)
     stops = FAILING_TIME * n.velocity + 0.5 * float(n.velocity @ n.velocity) / (
         STOP_SHARE * params.strongest) * along
     variance = float(n.position_covariance.trace())
-    return Expected((n.position + stops).tolist(), [*STILL], [*STILL],
-                    SURE * math.sqrt(max(variance, 0.0) / 3.0), 0.0, [*STILL])
+    return Prediction((n.position + stops).tolist(), [*ZERO_VECTOR], [*ZERO_VECTOR],
+                    RECEIVED_SIGMAS * math.sqrt(max(variance, 0.0) / 3.0), 0.0, [*ZERO_VECTOR])
 
 
-def _aside(away: Sequence[float]) -> list[float]:
+def _pass_beside(away: Sequence[float]) -> list[float]:
     """Return a unit vector between away from a place and across: to pass beside it."""
     x, y, _ = away
     return [math.sqrt(0.5) * (x - y), math.sqrt(0.5) * (y + x), 0.0]
@@ -376,7 +377,7 @@ def _sight_bounds(memory: Memory, scene: Scene, velocity: Sequence[float], view:
     if faced is None or not view or faced.received:
         return []
     n = memory.flock[faced.name]
-    it = scene.expected[faced.name]
+    it = scene.predictions[faced.name]
     offset = difference(it.position, me.position.tolist())
     bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:

@@ -21,8 +21,8 @@ Nothing here reads a clock. The assumptions about a neighbor at the time when a 
    at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
    An acceleration a as small as the noise of an estimate counts as
    a / (1 + (ACCELERATION_NOISE / a)^4): otherwise the noise would make the guard jerk.
-2. If the estimate is older than SEEN, its acceleration may only increase the distance that the
-   vehicle keeps: the vehicle never follows a guess.
+2. If the estimate is older than MAX_ACCELERATION_AGE, its acceleration may only increase the
+   distance that the vehicle keeps: the vehicle never follows a guess.
 3. Up to FRESH, and up to ``heard_timeout`` if it was received from another vehicle, the margin of
    the guard covers deviations from 1. Later the neighbor may be anywhere in a growing sphere
    around the place of 1: it reaches as far as ``leader_acceleration_max`` and ``leader_speed_max``
@@ -122,19 +122,19 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
     return None
 
 
-def far(n: Neighbor, own: OwnState | None) -> Rejection | None:
+def too_far(n: Neighbor, own: OwnState | None) -> Rejection | None:
     """Return the rejection of a neighbor farther away than any can be seen, or None."""
     distance = 0.0 if own is None else math.dist(n.position.tolist(), own.position.tolist())
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
 
 
-def at(moving: Moving, now: float) -> Moving:
+def propagate(moving: Moving, now: float) -> Moving:
     """Return the state carried to ``now`` with constant velocity."""
     return moving._replace(
         stamp=now, position=moving.position + (now - moving.stamp) * moving.velocity)
 
 
-def newest(neighbors: Iterable[Neighbor], own: OwnState) -> Neighbor | None:
+def find_newest(neighbors: Iterable[Neighbor], own: OwnState) -> Neighbor | None:
     """Return the newest estimate; of equally new ones the nearest, then the first by name."""
     return min(neighbors, default=None, key=lambda n: (
         -n.stamp, math.dist(n.position, own.position), n.name))
@@ -160,11 +160,11 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
 TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
 ACCELERATION_NOISE = 0.2  # m/s^2: an acceleration of a neighbor below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbor is expected to keep its acceleration
-SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
+MAX_ACCELERATION_AGE = 0.25  # s: the acceleration of an older estimate is a guess, not followed
 FRESH = 0.12  # s up to which the guard's margin covers deviations of a neighbor's motion
 
 
-class Expected(NamedTuple):
+class Prediction(NamedTuple):
     """
     The prediction of a neighbor for the time when a command acts.
 
@@ -185,8 +185,8 @@ class Expected(NamedTuple):
     """Velocity in TRUSTED_TIME, if the acceleration lasts so long (3,), m/s."""
 
 
-def expected(n: Neighbor, acceleration: Sequence[float], age: float,
-             params: PlannerParams) -> Expected:
+def predict(n: Neighbor, acceleration: Sequence[float], age: float,
+            params: PlannerParams) -> Prediction:
     """Return the prediction of a neighbor whose estimate is of an age, s."""
     velocity = n.velocity.tolist()
     size = math.hypot(*acceleration)
@@ -202,7 +202,7 @@ def expected(n: Neighbor, acceleration: Sequence[float], age: float,
         params.leader_acceleration_max)
     speeding = min(blind, (params.leader_speed_max + math.hypot(*velocity)) / most) if (
         blind > 0.0 and most > 0.0) else 0.0
-    return Expected(
+    return Prediction(
         [x + age * v + gained * u for x, v, u in zip(n.position.tolist(), velocity, a)],
         [v + soon * u for v, u in zip(velocity, a)], a if age < TRUSTED_TIME else [0.0, 0.0, 0.0],
         most * speeding * (blind - 0.5 * speeding), most * speeding,

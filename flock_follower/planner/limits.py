@@ -31,18 +31,18 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
-from flock_follower.planner.projection import Discs, lexicographic, product, TOLERANCE
+from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, lexicographic, product
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in
 # a caller's check, cannot exceed it; a limited vector thus passes a second time unchanged.
-INSIDE = 1.0 - 1e-12
+INSIDE_SHARE = 1.0 - 1e-12
 # Accelerations are limited to this share of a_max: rounding to the 24 bits of a MAVLink float must
 # not exceed a_max.
 SENT_INSIDE = 1.0 - 2e-7
 
 # Reasons of bounds.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
-INSISTENCE = 10.0  # of cohesion beyond ``v_max``: see ``constrained``
+INSISTENCE = 10.0  # of cohesion beyond ``v_max``: see ``keep_bounds``
 STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
 
 
@@ -55,7 +55,7 @@ class LimitedCommand(NamedTuple):
     """Reason why it differs from the nominal one, or '': 'a_max', 'v_max', 'a_max, v_max',
     reasons of bounds, or the input that is not finite."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
+    """Unit vector (3,) away from the neighbor that the guard keeps clear of first, if any."""
 
 
 class Bound(NamedTuple):
@@ -76,14 +76,14 @@ def limit_norm(vector: ArrayLike, limit: float) -> Array:
     v = np.array(vector, dtype=float)
     numbers = v.tolist()
     length = math.hypot(*numbers)
-    if length < limit * INSIDE:  # most often, and NaN fails
+    if length < limit * INSIDE_SHARE:  # most often, and NaN fails
         return v
     if not all(map(math.isfinite, numbers)):
         return np.zeros_like(v)
     if length < SANE and math.sqrt(float(v @ v)) <= limit:  # longer ones might overflow
         return v
     direction = v / max(map(abs, numbers))  # likewise
-    return direction * (limit * INSIDE / math.sqrt(float(direction @ direction)))
+    return direction * (limit * INSIDE_SHARE / math.sqrt(float(direction @ direction)))
 
 
 def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
@@ -107,13 +107,13 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     :param v_max: largest speed, m/s, at least 0.
     :param period: time T for which the acceleration is held, s, above 0.
     :param axis: unit vector (3,) along which the acceleration is cut last, because it keeps clear
-        of a neighbour: as much of it is left as the limits allow.
+        of a neighbor: as much of it is left as the limits allow.
     """
     nominal, v = np.asarray(acceleration, dtype=float), np.asarray(velocity, dtype=float)
     requested, flown, strongest = nominal.tolist(), v.tolist(), a_max * SENT_INSIDE
     reached = [x + u * period for x, u in zip(flown, requested)]
-    if (math.hypot(*requested) < strongest * INSIDE
-            and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
+    if (math.hypot(*requested) < strongest * INSIDE_SHARE
+            and math.hypot(*reached) < v_max * INSIDE_SHARE):  # most often; NaN fails
         return LimitedCommand(nominal.copy(), '')
     if not all(map(math.isfinite, flown)):
         return LimitedCommand(np.zeros(3), 'velocity not finite')
@@ -178,10 +178,10 @@ def _separation_first(a: Array, v: Array, axis: Array, a_max: float, v_max: floa
     farther than ``a``, the part along ``axis`` stays as it is. The part across is the nearest one
     in both discs that the plane across ``axis`` cuts out of the balls.
     """
-    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
-    strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, -v / period
-    along = float(axis @ centre)
-    side = centre - along * axis
+    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
+    strongest, reach, center = a_max * SENT_INSIDE, fastest / period, -v / period
+    along = float(axis @ center)
+    side = center - along * axis
     beside = math.hypot(*side.tolist())
     highest = Discs(0j, strongest, complex(along, beside), reach).best(1 + 0j, far=True).real
     level = min(float(axis @ a), highest)
@@ -196,14 +196,14 @@ def _separation_first(a: Array, v: Array, axis: Array, a_max: float, v_max: floa
     return limit_command(found, v, a_max, fastest, period).acceleration
 
 
-def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
+def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
                 v_max: float, period: float) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.
 
     Its vertical part stays as it is. Of all horizontal accelerations with ``|a| <= a_max`` and
     ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the nearest to ``command`` is taken.
-    With one neighbour: its radial part is clipped to the bounds, or as far towards them as the
+    With one neighbor: its radial part is clipped to the bounds, or as far towards them as the
     limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
     the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
 
@@ -214,13 +214,13 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
-    :param required: the bounds, the most important first (see ``ordered``).
+    :param required: the bounds, the most important first (see ``sort_bounds``).
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
     speed = math.hypot(*v.tolist())
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST_OWN
-    fastest = max(v_max, speed * INSIDE) if flyable else v_max
+    fastest = max(v_max, speed * INSIDE_SHARE) if flyable else v_max
     requested = a.tolist()
     if not flyable or not all(map(math.isfinite, requested)) or all(
             scalar_product(each.normal, requested) >= each.least for each in required):
@@ -251,7 +251,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.
     acting = [k for k, (normal, least) in enumerate(bounds)
-              if missed[k] or product(normal, point) <= least + TOLERANCE]
+              if missed[k] or product(normal, point) <= least + LENGTH_TOLERANCE]
     axis = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
         bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
     binding = sorted({sides[k][2] for k in acting}, key=REASONS.index)

@@ -32,16 +32,16 @@ from flock_follower.messages import (
     RELATIVE,
     with_acceleration,
 )
-from flock_follower.planner.inputs import at, Neighbor, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import odometry_fault, State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldOfView, View
 from flock_follower.planner.step import Decision, step
 
-#: Largest standard deviation of a neighbour's yaw that is used, rad.
+#: Largest standard deviation of a neighbor's yaw that is used, rad.
 MAX_YAW_STD = 0.5
-#: ns between the stamps of a neighbour's state and of its acceleration, two messages.
+#: ns between the stamps of a neighbor's state and of its acceleration, two messages.
 ACCELERATION_AGE = 100_000_000
 #: Processed images of which the stamps are kept.
 FRAMES = 20
@@ -105,7 +105,7 @@ class PlannerLoop:
         :param silence: time since the message before, s.
         """
         # If the vehicle does not fly now, the next tick or the next message finds it waiting.
-        self._interrupted |= bool(self.waiting(silence))
+        self._interrupted |= bool(self.waiting_reason(silence))
         before, self._bridge = self._bridge, parse(text)
         if not self._require_bridge or self._bridge.name != TAKEN_OVER:
             return self._bridge
@@ -116,7 +116,7 @@ class PlannerLoop:
             self._disengaged_by = f'taken over{why}: call planner/engage to follow again'
         return self._bridge
 
-    def waiting(self, bridge_age: float = math.inf) -> str:
+    def waiting_reason(self, bridge_age: float = math.inf) -> str:
         """
         Return the reason why it is not active although engaged, or ''.
 
@@ -144,7 +144,7 @@ class PlannerLoop:
 
     def take_neighbor(self, neighbor: OdometryState, received: bool = False) -> None:
         """
-        Take a neighbour's state.
+        Take a neighbor's state.
 
         :param received: whether another vehicle reported it; else the own camera sees it.
         :raises ValueError: if it is not in the frame of the odometry.
@@ -187,12 +187,12 @@ class PlannerLoop:
         return (nanoseconds - (self._epoch or 0)) * 1e-9
 
     def distance(self) -> tuple[str, float] | None:
-        """Return name and distance, m, of the neighbour faced, else of the nearest, if any."""
+        """Return name and distance, m, of the neighbor faced, else of the nearest, if any."""
         now, me, faced = self.memory.now, self.memory.own, self.memory.faced
         if now is None or me is None or not self.memory.neighbors:
             return None
-        here = at(me, now).position
-        return min(((n.name, math.dist(at(n, now).position, here))
+        here = propagate(me, now).position
+        return min(((n.name, math.dist(propagate(n, now).position, here))
                     for n in self.memory.neighbors.values()),
                    key=lambda known: (known[0] != faced, known[1], known[0]))
 
@@ -205,7 +205,7 @@ class PlannerLoop:
         """
         Return the decision for a time, ns, and the command to publish, if any.
 
-        :param bridge_age: see :meth:`waiting`.
+        :param bridge_age: see :meth:`waiting_reason`.
         """
         if self._epoch is None:
             self._epoch = nanoseconds
@@ -227,7 +227,7 @@ class PlannerLoop:
         looked = None if self._looked is None else self.seconds(self._looked)
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
-        waiting = self.waiting(bridge_age) if self.engaged else self._disengaged_by
+        waiting = self.waiting_reason(bridge_age) if self.engaged else self._disengaged_by
         self.memory, decision = step(self.memory, now, self.engaged, own, neighbors, params,
                                      looked, waiting, self.view, self.ground,
                                      [self.seconds(stamp) for stamp in self._frames])
@@ -254,6 +254,6 @@ class PlannerLoop:
 
 
 def _yaw(n: OdometryState) -> float | None:
-    """Return a neighbour's yaw, rad, or None if it is not known."""
+    """Return a neighbor's yaw, rad, or None if it is not known."""
     return yaw_from_quaternion(n.quaternion) if (
         0.0 <= n.pose_covariance[5, 5] <= MAX_YAW_STD ** 2) else None  # NaN is not known

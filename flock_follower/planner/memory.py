@@ -31,12 +31,12 @@ from flock_follower.geometry import Array
 from flock_follower.messages import FUTURE_TOLERANCE, ODOMETRY_JUMP
 from flock_follower.planner.inputs import (
     distance_known,
-    far,
     implausible,
     Moving,
     Neighbor,
     OwnState,
     Rejection,
+    too_far,
     uncertain,
     untimely,
 )
@@ -56,7 +56,8 @@ class Motion(NamedTuple):
     acceleration: list[float]
 
 
-def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
+def update_motions(motions: Mapping[str, Motion],
+                   neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
     """
     Return the motions of the neighbors, brought up to their newest estimates.
 
@@ -103,7 +104,7 @@ class Loss(NamedTuple):
     name: str
     """Name of the lost neighbor; '' if its place is unknown."""
 
-    def retreated(self, position: Array) -> float:
+    def retreat_distance(self, position: Array) -> float:
         """Return the horizontal distance of a position (3,) from the origin, m."""
         return math.dist(position[:2], self.origin[:2])
 
@@ -170,7 +171,7 @@ class Memory(NamedTuple):
 
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
         """Return the memory for another odometry frame, without positions of the old frame."""
-        altitude = None if self.altitude is None else Altitude.begun(own, None, params)
+        altitude = None if self.altitude is None else Altitude.begin(own, None, params)
         return Memory(
             now=self.now, own=own, faced=self.faced, followed=self.followed, begun=self.begun,
             given_up=self.given_up, altitude=altitude, yaw=self.yaw, command=self.command,
@@ -201,7 +202,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
             if me is not None and own.relative is not me.relative:
                 memory, me = memory.in_frame_of(own, now, params), own
                 jumped, drag = own.stamp, memory.drag
-            jump = 0.0 if me is None else off(own, me)
+            jump = 0.0 if me is None else prediction_error(own, me)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
@@ -211,14 +212,14 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 drag = _drag(memory, me, own, params)
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
-            if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
+            if not untimely(n.stamp, now, max_age(n, params)) and not too_far(n, me)}
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in in_order(neighbors):
         what, before = 'received estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
-        unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
-        outside, old = far(n, me), jumped is not None and n.stamp < jumped
+        unusable = implausible(n) or untimely(n.stamp, now, max_age(n, params))
+        outside, old = too_far(n, me), jumped is not None and n.stamp < jumped
         if (known := member(params.vehicles, n.name, n.received)) is not n.member:
             n = n._replace(member=known)
         if vague and not (unusable or outside or old or n.received) and (
@@ -231,7 +232,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         elif before is None or (before.received and not n.received):  # sightings come first
             kept[n.name] = n
         elif before.received == n.received and n.stamp >= before.stamp:
-            if (by := off(n, before)) > NEIGHBOR_JUMP:
+            if (by := prediction_error(n, before)) > NEIGHBOR_JUMP:
                 rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
                 kept[n.name] = n
@@ -273,12 +274,18 @@ def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams
     return memory.drag + min(elapsed / DRAG_TIME, 1.0) * (lacking - memory.drag)
 
 
-def longest(n: Neighbor, params: PlannerParams) -> float:
+def update_pending(memory: Memory, command: Array, elapsed: float, params: PlannerParams) -> Array:
+    """Return the velocity (3,), m/s, that is commanded and not flown, with one more command."""
+    left = math.exp(-elapsed / params.response_time)
+    return left * memory.pending + (1.0 - left) * params.response_time * command
+
+
+def max_age(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
     return params.heard_timeout if n.received else params.predict_timeout
 
 
-def off(now: Moving, before: Moving) -> float:
+def prediction_error(now: Moving, before: Moving) -> float:
     """Return the distance of a state from its prediction by the state before, m."""
     elapsed = now.stamp - before.stamp
     return math.dist(now.position.tolist(), [x + elapsed * v for x, v in zip(

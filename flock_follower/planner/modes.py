@@ -22,8 +22,8 @@ IDLE     not engaged, or no vehicle flies the commands     none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
 TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
          one received of at most ``heard_timeout``
-COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbour
-HOLD     all are older than that, the neighbour is         brake to a hover; look where it was
+COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbor
+HOLD     all are older than that, the neighbor is         brake to a hover; look where it was
          occluded, odometry is overdue, or no image was    lost, then all round
          processed for a while
 RELATIVE odometry lost or contradicted, and the bridge     see ``relative``; without an
@@ -63,12 +63,12 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
     :param fault: fault of the own odometry or of perception, or ''.
-    :param youngest: age of the youngest estimate of a neighbour in sight, s, or None.
+    :param youngest: age of the youngest estimate of a neighbor in sight, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: reason why it may not command yet, or why it was disengaged, or ''.
-    :param given_up: whether it had no neighbour for too long, and must be engaged again.
+    :param given_up: whether it had no neighbor for too long, and must be engaged again.
     :param received: age of the youngest estimate reported by another vehicle, s, or None.
-    :param occluded: whether the faced neighbour is occluded.
+    :param occluded: whether the faced neighbor is occluded.
     """
     lost = State.SEARCH if followed is None else State.HOLD
     unseen = 0.0 if followed is None else followed
@@ -103,7 +103,7 @@ LATEST = 0.8  # share of odom_timeout: older odometry always is late, to brake b
 OVERDUE = 1.2  # times the greatest age that the last messages reached
 
 
-def late(own: OwnState | None, now: float, params: PlannerParams) -> str:
+def odometry_delay(own: OwnState | None, now: float, params: PlannerParams) -> str:
     """
     Return that odometry is late, or that its source is too slow, or ''.
 

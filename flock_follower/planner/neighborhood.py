@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.flock import neighbor_graph
-from flock_follower.flock.neighbor_graph import graph_law, HELD
+from flock_follower.flock.neighbor_graph import graph_law, HELD_FACTOR
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.limits import brake, limit_norm
@@ -71,8 +71,8 @@ class Neighborhood(NamedTuple):
 NOBODY = Neighborhood((), {}, frozenset(), None, None, {})
 
 
-def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: PlannerParams,
-             elapsed: float) -> Neighborhood:
+def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
+                       params: PlannerParams, elapsed: float) -> Neighborhood:
     """
     Return the relations of the neighbors at hand to the own vehicle.
 
@@ -98,9 +98,9 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: Pl
     seen = [[n for n in some if not n.received] for some in (ahead, ends, leaders)]
     # Never turn away from a neighbor in sight to one that is only received.
     first = next(filter(None, [*seen, ahead, leaders, ends]), [])
-    faced = _nearest(distances, memory.faced, first)
+    faced = _find_nearest(distances, memory.faced, first)
     # Several followers without a leader would follow their own motion if they followed each other.
-    level = _nearest(distances, memory.faced, leaders) or (faced if len(ends) < 2 else None)
+    level = _find_nearest(distances, memory.faced, leaders) or (faced if len(ends) < 2 else None)
     return Neighborhood(flock, shares, joined, faced, level, distances)
 
 
@@ -127,11 +127,11 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 
-def _nearest(distances: Mapping[str, float], held: str,
-             flock: Sequence[Neighbor]) -> Neighbor | None:
+def _find_nearest(distances: Mapping[str, float], held: str,
+                  flock: Sequence[Neighbor]) -> Neighbor | None:
     """Return the nearest neighbor, or the one held, unless another is clearly nearer."""
     return min(flock, default=None, key=lambda n: (
-        distances[n.name] / (HELD if n.name == held else 1.0), n.name))
+        distances[n.name] / (HELD_FACTOR if n.name == held else 1.0), n.name))
 
 
 KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
@@ -157,8 +157,8 @@ def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> l
                       for name in sorted(missing))]
 
 
-def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
-           params: PlannerParams) -> Neighbor | None:
+def choose_leader(memory: Memory, neighbors: Neighborhood, me: OwnState,
+                  params: PlannerParams) -> Neighbor | None:
     """
     Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
 

@@ -51,8 +51,8 @@ def planner_params(values: Mapping[str, Any], name: str = '') -> PlannerParams:
     """
     Return the parameters of the planner's core.
 
-    :param name: of this vehicle; the neighbours' file may contain it, too.
-    :raises ValueError: if they do not fit together, cannot fly, or the neighbours' file is wrong.
+    :param name: of this vehicle; the neighbors' file may contain it, too.
+    :raises ValueError: if they do not fit together, cannot fly, or the neighbors' file is wrong.
     :raises OSError: if it cannot be read.
     """
     cameras(values)
@@ -64,7 +64,7 @@ def planner_params(values: Mapping[str, Any], name: str = '') -> PlannerParams:
 
 @lru_cache
 def _vehicles(path: str) -> Mapping[str, Member]:
-    """Return the neighbours by name; read once, because parameters are set in flight, too."""
+    """Return the neighbors by name; read once, because parameters are set in flight, too."""
     if not path:
         return {}
     return {n.name: Member(n.role, n.radius, tuple(

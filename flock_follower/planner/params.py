@@ -88,7 +88,7 @@ class GuardParams(Checked):
         f'guard: margin to each edge, at most {WIDEST_MARGIN:g} of the width of the band',
         live=True)
 
-    def closing(self, gap: float, b: float | None = None) -> tuple[float, float]:
+    def closing_speed(self, gap: float, b: float | None = None) -> tuple[float, float]:
         """
         Return S, m/s, and its slope S', 1/s, for a gap, m, to the margin of an edge.
 
@@ -105,7 +105,7 @@ class GuardParams(Checked):
 
 
 class Edges(NamedTuple):
-    """The distances, m, from a neighbour to stay between, and the uncertainty of its position."""
+    """The distances, m, from a neighbor to stay between, and the uncertainty of its position."""
 
     near: float
     far: float = math.inf

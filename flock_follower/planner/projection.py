@@ -31,8 +31,8 @@ from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
-TOLERANCE = 1e-9  # of lengths of the order of 1; the caller cuts off the rest
-ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below TOLERANCE
+LENGTH_TOLERANCE = 1e-9  # of lengths of the order of 1; the caller cuts off the rest
+ROUNDING_ERROR = 1e-11  # likewise inside a search: far above rounding, far below LENGTH_TOLERANCE
 PARALLEL = 1e-11  # slope along a line of a bound that is parallel to it but for rounding
 _HUGE = 1e30  # stands for infinity, which cannot be subtracted from itself
 
@@ -48,7 +48,7 @@ def product(one: complex, other: complex) -> float:
 class Discs(NamedTuple):
     """All points in both of two discs; they must have one in common."""
 
-    centre: complex
+    center: complex
     radius: float
     other: complex
     other_radius: float
@@ -59,37 +59,37 @@ class Discs(NamedTuple):
 
         :param far: the goal is a direction, not zero: return the point that is farthest in it.
         """
-        centre, radius, other, other_radius = self
-        if not far and (abs(goal - centre) <= radius + TOLERANCE
-                        and abs(goal - other) <= other_radius + TOLERANCE):
+        center, radius, other, other_radius = self
+        if not far and (abs(goal - center) <= radius + LENGTH_TOLERANCE
+                        and abs(goal - other) <= other_radius + LENGTH_TOLERANCE):
             return goal
-        towards = goal / abs(goal) if far else goal - centre
+        towards = goal / abs(goal) if far else goal - center
         for here, here_radius, there, there_radius in (
-                (centre, radius, other, other_radius), (other, other_radius, centre, radius)):
+                (center, radius, other, other_radius), (other, other_radius, center, radius)):
             distance = abs(goal - here)
             if far:
                 point = here + here_radius * towards
             else:
                 point = goal if distance <= here_radius else (
                     here + (goal - here) * (here_radius / distance))
-            if abs(point - there) <= there_radius + TOLERANCE:
+            if abs(point - there) <= there_radius + LENGTH_TOLERANCE:
                 return point
         return self._on_rim(towards)
 
     def _on_rim(self, towards: complex) -> complex:
         """Return the point where both rims meet that lies farthest in a direction."""
-        centre, radius, other, other_radius = self
-        distance = abs(other - centre)
+        center, radius, other, other_radius = self
+        distance = abs(other - center)
         if distance == 0.0:
-            return centre
-        axis = (other - centre) / distance
+            return center
+        axis = (other - center) / distance
         along = (distance + (radius - other_radius) * (radius + other_radius) / distance) / 2.0
         along = min(max(along, -radius), radius)
         across = towards - axis * product(axis, towards)
         length = abs(across)
-        if length <= TOLERANCE * abs(towards):
-            return centre + along * axis  # every direction is as good, and this lies inside
-        return centre + along * axis + across * (
+        if length <= LENGTH_TOLERANCE * abs(towards):
+            return center + along * axis  # every direction is as good, and this lies inside
+        return center + along * axis + across * (
             math.sqrt(max(radius ** 2 - along ** 2, 0.0)) / length)
 
 
@@ -107,23 +107,23 @@ class _Line(NamedTuple):
     @classmethod
     def of(cls, normal: complex, level: float, discs: Discs) -> _Line:
         """Return the line of the points whose product with the normal is ``level``."""
-        centre, radius, other, other_radius = discs
+        center, radius, other, other_radius = discs
         size = abs(normal)
         unit, least = (normal / size, level / size) if size else (normal, level)
-        height, other_height = least - product(unit, centre), least - product(unit, other)
+        height, other_height = least - product(unit, center), least - product(unit, other)
         cut = math.sqrt(max((radius - height) * (radius + height), 0.0))
         other_cut = math.sqrt(
             max((other_radius - other_height) * (other_radius + other_height), 0.0))
         along = 1j * unit
-        between = product(along, other - centre)
+        between = product(along, other - center)
         low, high = max(-cut, between - other_cut), min(cut, between + other_cut)
         gap = max(abs(height) - radius, abs(other_height) - other_radius,
                   abs(between) - cut - other_cut)
         if low > high:  # by rounding, or because the line misses them
             low = high = (low + high) / 2.0
-        return cls(centre + height * unit, along, low, high, gap if size else math.inf)
+        return cls(center + height * unit, along, low, high, gap if size else math.inf)
 
-    def at(self, goal: complex, far: bool, low: float, high: float) -> complex:
+    def best_between(self, goal: complex, far: bool, low: float, high: float) -> complex:
         """Return the best point from ``low`` to ``high``: see ``optimum``."""
         if far:
             best = math.copysign(math.inf, self.slope(goal))
@@ -140,7 +140,7 @@ class _Line(NamedTuple):
         """Return the range of y in which all bounds are kept, or None."""
         low, high = self.low, self.high
         for normal, least in sides:
-            slope, value = self.slope(normal), least - product(normal, self.foot) - ROUNDING
+            slope, value = self.slope(normal), least - product(normal, self.foot) - ROUNDING_ERROR
             if slope > 0.0:
                 low = max(low, value / slope)
             elif slope < 0.0:
@@ -160,11 +160,11 @@ def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tu
     """
     point = discs.best(goal, far and goal != 0.0)
     for k, (normal, least) in enumerate(sides):
-        if normal.real * point.real + normal.imag * point.imag < least - ROUNDING:
+        if normal.real * point.real + normal.imag * point.imag < least - ROUNDING_ERROR:
             line = _Line.of(normal, least, discs)
-            if line.gap > ROUNDING or (ends := line.room(sides[:k])) is None:
+            if line.gap > ROUNDING_ERROR or (ends := line.room(sides[:k])) is None:
                 return point, k
-            point = line.at(goal, far, *ends)
+            point = line.best_between(goal, far, *ends)
     return point, len(sides)
 
 
@@ -197,4 +197,4 @@ def lexicographic(goal: complex, sides: Sequence[Side], discs: Discs) -> complex
             low = max(low, min(there, high))
         else:
             high = min(high, max(there, low))
-    return line.at(goal, False, low, high)
+    return line.best_between(goal, False, low, high)

@@ -20,9 +20,9 @@ drifts. That drift is the same in the leader's estimate, so that distance and re
 not have it. Only these two are used. The speed over the ground is neither known nor bounded.
 
 The follower is led to the middle of the law's band by a relative velocity, which is bounded, and
-reached with the time constant TIME. So all relative motion is damped; the common motion of both is
-the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer offsets
-the relative acceleration that was not commanded: the error of the tilt, which accelerates
+reached with the time constant VELOCITY_TIME. So all relative motion is damped; the common motion
+of both is the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer
+offsets the relative acceleration that was not commanded: the error of the tilt, which accelerates
 the follower, and the leader's own. Other neighbors in sight bound the approach.
 """
 
@@ -36,13 +36,20 @@ import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
-from flock_follower.planner.inputs import at, expected, Neighbor, newest, OwnState, untimely
+from flock_follower.planner.inputs import (
+    find_newest,
+    Neighbor,
+    OwnState,
+    predict,
+    propagate,
+    untimely,
+)
 from flock_follower.planner.limits import limit_norm
-from flock_follower.planner.memory import Memory
+from flock_follower.planner.memory import Memory, update_pending
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.scene import Decision
-from flock_follower.planner.vertical_yaw import Altitude, facing, turning
+from flock_follower.planner.vertical_yaw import Altitude, face_yaw, turn_rate
 
 #: Largest vertical acceleration, m/s^2, besides the offset of the disturbance: the altitude
 #: leaves the rest of ``RELATIVE_MAX`` to the distance.
@@ -50,15 +57,18 @@ VERTICAL_MAX = 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
-SETTLING = 1.0
-#: Relative speed for each metre off the middle of the band, 1/s, and the largest, m/s.
-GAIN = 0.5
-SPEED = 0.4
+SETTLING_TIME = 1.0
+#: Relative speed for each meter off the middle of the band, 1/s.
+GAP_GAIN = 0.5
+#: Largest relative speed, m/s.
+APPROACH_SPEED_MAX = 0.4
 #: Time constant with which the relative velocity is reached, s.
-TIME = 0.6
-#: Of the observer of the disturbance, 1/s, and the most that is offset, m/s^2: without odometry
-#: the tilt of PX4 was wrong by 1 m/s^2 for 10 s.
-BANDWIDTH, OFFSET_MAX = 0.8, 0.8
+VELOCITY_TIME = 0.6
+#: Of the observer of the disturbance, 1/s.
+BANDWIDTH = 0.8
+#: Largest disturbance that is offset, m/s^2: without odometry the tilt of PX4 was wrong by 1 m/s^2
+#: for 10 s.
+OFFSET_MAX = 0.8
 #: m beyond the band: an error of the tilt is then larger than the acceleration that may offset it,
 #: the follower runs away, and commands nothing more.
 RUNAWAY = 1.0
@@ -76,7 +86,7 @@ class Disturbance(NamedTuple):
     acceleration: Array = np.zeros(3)
     """(3,), m/s^2."""
 
-    def observed(self, velocity: Array, command: Array | None, elapsed: float,
+    def update(self, velocity: Array, command: Array | None, elapsed: float,
                  response_time: float) -> Disturbance:
         """Return the estimate after a relative velocity (3,), m/s: a Luenberger observer."""
         if self.velocity is None or command is None:
@@ -96,48 +106,47 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     old = untimely(own.stamp, now, params.odom_timeout)
     seen = {name: n for name, n in memory.neighbors.items()
             if not n.received and now - n.stamp <= OLDEST_MARKER}
-    leader = seen.get(memory.faced) or newest(
+    leader = seen.get(memory.faced) or find_newest(
         (n for n in seen.values() if n.member.role != AVOID), own)
     if old is not None or leader is None:
-        return _held(memory, 'no neighbor in sight' if old is None else (
+        return _hold(memory, 'no neighbor in sight' if old is None else (
             f'the motion by attitude is {old.detail} old'))
-    me, there = at(own, now), at(leader, now)
+    me, there = propagate(own, now), propagate(leader, now)
     gap, _ = _gap(there.position, me, leader, params)
     if gap > math.sqrt(params.law.d1) + RUNAWAY:
-        return _held(memory, f'{leader.name} is {gap:.1f} m away')
-    altitude = (memory.altitude or Altitude.begun(me, None, params))._replace(
+        return _hold(memory, f'{leader.name} is {gap:.1f} m away')
+    altitude = (memory.altitude or Altitude.begin(me, None, params))._replace(
         lowest=-math.inf, highest=math.inf)
     rising = me.velocity
     if params.altitude_mode == 'follow':
         altitude = altitude._replace(held=float(there.position[2]) + params.altitude_offset)
         rising = me.velocity - [0.0, 0.0, there.velocity[2]]
-    disturbance = (memory.disturbance or Disturbance()).observed(
+    disturbance = (memory.disturbance or Disturbance()).update(
         me.velocity - there.velocity, memory.command, elapsed, params.response_time)
     bias = -disturbance.acceleration
-    altitude, vertical = altitude._replace(climb=0.0).controlled(
+    altitude, vertical = altitude._replace(climb=0.0).control(
         me._replace(velocity=rising), params)
     others = [n for n in seen.values() if n is not leader]
-    command = limited(
-        level(me, memory.pending, leader, others, params) + bias[:2],
+    command = limit_relative(
+        level_command(me, memory.pending, leader, others, params) + bias[:2],
         min(max(vertical, -VERTICAL_MAX), VERTICAL_MAX) + float(bias[2]), memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
-    yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
-    left = math.exp(-elapsed / params.response_time)
+    yaw = face_yaw(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     return memory._replace(
         faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
         disturbance=disturbance,
-        pending=left * memory.pending + (1.0 - left) * params.response_time * (command - bias),
+        pending=update_pending(memory, command - bias, elapsed, params),
     ), Decision(State.RELATIVE, 'no odometry: flies by the marker alone', command, yaw,
-                turning(last, yaw, me, params, elapsed), stamp=leader.stamp)
+                turn_rate(last, yaw, me, params, elapsed), stamp=leader.stamp)
 
 
-def _held(memory: Memory, reason: str) -> tuple[Memory, Decision]:
+def _hold(memory: Memory, reason: str) -> tuple[Memory, Decision]:
     return memory._replace(command=None, pending=np.zeros(3)), Decision(
         State.HOLD, f'no odometry, and {reason}')
 
 
-def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighbor],
-          params: PlannerParams) -> Array:
+def level_command(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighbor],
+                  params: PlannerParams) -> Array:
     """
     Return the horizontal acceleration (2,), m/s^2, without limits.
 
@@ -147,19 +156,20 @@ def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighb
     """
     law, age = params.law, me.stamp - leader.stamp
     a = [0.0, 0.0, 0.0] if leader.acceleration is None else leader.acceleration.tolist()
-    there = expected(leader, a, age, params)
+    there = predict(leader, a, age, params)
     velocity = me.velocity + coming
     gap, towards = _gap(np.array(there.position), me, leader, params)
     middle = math.sqrt(0.5 * (law.d0 + law.d1))
-    approach = limit_norm(GAIN * (gap - middle) * towards, min(SPEED, params.v_max))
+    fastest = min(APPROACH_SPEED_MAX, params.v_max)
+    approach = limit_norm(GAP_GAIN * (gap - middle) * towards, fastest)
     relative = approach + np.array(there.velocity[:2]) - velocity[:2]
-    result: Array = relative / TIME
+    result: Array = relative / VELOCITY_TIME
     for n in others:
         other = n.position + (me.stamp - n.stamp) * n.velocity
         gap, towards = _gap(other, me, n, params)
         closing = float(towards @ (velocity - n.velocity)[:2])
         # The full m in a narrow band, too: without odometry no far edge to others is kept.
-        most = ((gap - math.sqrt(law.d0) - params.guarding.m) / CLOSING - closing) / TIME
+        most = ((gap - math.sqrt(law.d0) - params.guarding.m) / CLOSING - closing) / VELOCITY_TIME
         result = result - max(float(towards @ result) - most, 0.0) * towards
     return result
 
@@ -172,7 +182,7 @@ def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tupl
     return distance - params.radius - n.member.radius, towards
 
 
-def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
+def limit_relative(horizontal: Array, vertical: float, last: Array | None) -> Array:
     """
     Return the acceleration (3,), m/s^2: within the limit, the vertical first, and without steps.
 

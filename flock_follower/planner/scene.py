@@ -31,23 +31,28 @@ import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.inputs import (
-    at,
-    Expected,
-    expected,
+    find_newest,
     Neighbor,
-    newest,
     OwnState,
+    predict,
+    Prediction,
+    propagate,
     Rejection,
     TRUSTED_TIME,
 )
 from flock_follower.planner.limits import REASONS
-from flock_follower.planner.memory import by_name, Loss, Memory, observed
+from flock_follower.planner.memory import by_name, Loss, Memory, update_motions
 from flock_follower.planner.modes import State
-from flock_follower.planner.neighborhood import gathered, Neighborhood, NOBODY, sought
+from flock_follower.planner.neighborhood import (
+    build_neighborhood,
+    choose_leader,
+    Neighborhood,
+    NOBODY,
+)
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
-from flock_follower.planner.vertical_yaw import OVERHEAD
+from flock_follower.planner.vertical_yaw import OVERHEAD_DISTANCE
 
-SURE = 2.0  # standard deviations of a received position that count as possible places
+RECEIVED_SIGMAS = 2.0  # standard deviations of a received position that count as possible places
 
 
 class Decision(NamedTuple):
@@ -79,7 +84,7 @@ class Decision(NamedTuple):
     """The neighbors at the ends of its edges; others are only kept clear of."""
 
     @property
-    def guarded(self) -> bool:
+    def is_guarded(self) -> bool:
         """Return whether the guard altered the command."""
         return any(reason in self.limits for reason in REASONS)
 
@@ -98,7 +103,7 @@ class Scene(NamedTuple):
     """The leader to look for while others are followed."""
     missed: Neighbor | None
     """The lost neighbor: ``leader``, or the newest one of those lost if none is followed."""
-    expected: Mapping[str, Expected]
+    predictions: Mapping[str, Prediction]
     """Predictions of the neighbors to keep clear of, by name."""
 
 
@@ -107,31 +112,31 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
     """Return the memory with all to keep clear of, and the scene ``elapsed`` s after the last."""
     neighbors, leader = NOBODY, None
     if state is State.TRACK:
-        here = [at(n, me.stamp) for n in memory.neighbors.values()]
-        neighbors = gathered(memory, me, here, params, elapsed)
-        leader = sought(memory, neighbors, me, params)
+        here = [propagate(n, me.stamp) for n in memory.neighbors.values()]
+        neighbors = build_neighborhood(memory, me, here, params, elapsed)
+        leader = choose_leader(memory, neighbors, me, params)
     flock = _flock(memory, me.stamp, state, leader, params)
     missed = leader
     if leader is None and neighbors.faced is None:
-        missed = newest((n for n in flock.values() if n.member.role != AVOID), me)
-    brought_up = memory._replace(flock=flock, motions=observed(
+        missed = find_newest((n for n in flock.values() if n.member.role != AVOID), me)
+    brought_up = memory._replace(flock=flock, motions=update_motions(
         memory.motions, flock.values()) if flock else memory.motions)
     scene = Scene(state, me, blinded, neighbors, leader, missed, {
-        name: _expected(n, brought_up, me, params) for name, n in flock.items()})
+        name: _predict(n, brought_up, me, params) for name, n in flock.items()})
     return brought_up._replace(lost=_loss(memory, flock, scene, params)), scene
 
 
-def _expected(n: Neighbor, memory: Memory, me: OwnState,
-              params: PlannerParams) -> Expected:
+def _predict(n: Neighbor, memory: Memory, me: OwnState,
+              params: PlannerParams) -> Prediction:
     """Return the prediction of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
-    it = expected(n, memory.acceleration(n), age, params)
+    it = predict(n, memory.acceleration(n), age, params)
     if not n.received:  # errors of own sightings are part of the margin
         return it
     offset = np.subtract(it.position, me.position)
     along = offset / max(math.hypot(*offset.tolist()), SHORTEST)
     variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along
-    return it._replace(spread=it.spread + SURE * math.sqrt(max(float(variance), 0.0)))
+    return it._replace(spread=it.spread + RECEIVED_SIGMAS * math.sqrt(max(float(variance), 0.0)))
 
 
 def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
@@ -156,10 +161,10 @@ def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
             and now - n.stamp > params.heard_timeout)
 
 
-def awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
+def expected_now(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
     """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
     age = min(now - n.stamp, params.coast_timeout)
-    it = expected(n, memory.acceleration(n), age, params)
+    it = predict(n, memory.acceleration(n), age, params)
     return n._replace(stamp=n.stamp + age, position=np.array(it.position),
                       velocity=np.array(it.velocity))
 
@@ -180,22 +185,22 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
         free = float(towards @ me.position) + math.sqrt(params.law.d0)
         return Loss(towards, me.position, free, 0.0, float(me.position[2]), np.zeros(3), '')
     n = min(near, key=lambda n: (math.dist(n.position, me.position), n.name))
-    x, y, _ = awaited(n, memory, me.stamp, params).position - me.position
-    if math.hypot(x, y) > OVERHEAD:
+    x, y, _ = expected_now(n, memory, me.stamp, params).position - me.position
+    if math.hypot(x, y) > OVERHEAD_DISTANCE:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
+    soon = predict(n, memory.acceleration(n), TRUSTED_TIME, params)
     approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
-    side = beside(soon.velocity, np.subtract(me.position, soon.position))
+    side = across_path(soon.velocity, np.subtract(me.position, soon.position))
     return Loss(towards, me.position, float(towards @ n.position), approach,
                 float(n.position[2]), side, n.name)
 
 
-def beside(velocity: Sequence[float], offset: Array) -> Array:
+def across_path(velocity: Sequence[float], offset: Array) -> Array:
     """
     Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
 
-    :param velocity: of the neighbour (3,), m/s.
-    :param offset: own position minus the neighbour's (3,), m.
+    :param velocity: of the neighbor (3,), m/s.
+    :param offset: own position minus the neighbor's (3,), m.
     """
     x, y, _ = velocity
     length = math.hypot(x, y)

@@ -36,9 +36,9 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     wrap_angle,
 )
-from flock_follower.planner.inputs import at, Neighbor, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 
-MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
+IMAGE_MARGIN = 0.05  # rad from the edge of the image: half a marker, and a wobbling attitude
 WIDEST = 1.4  # rad off the axis of a fisheye lens, and off the direction ahead: usable up to here
 
 
@@ -92,7 +92,7 @@ class FieldOfView(NamedTuple):
             raise ValueError(f'camera_rpy = {angles}: the forward direction must be in the image')
         return cls(max(aside), -min(aside), max(up), -min(up), heading)
 
-    def outside(self, bearing: float, edge: float = 0.0) -> float:
+    def angle_outside(self, bearing: float, edge: float = 0.0) -> float:
         """Return by how much a bearing is outside the image, shrunk by ``edge``, rad; 0 inside."""
         off = wrap_angle(bearing - self.heading)
         return max(off - self.left + edge, edge - self.right - off, 0.0)
@@ -115,7 +115,7 @@ def visible(view: View, offset: Array, yaw: float, forward: float, margin: float
         return False
     edge = math.atan(margin / math.hypot(distance, z))
     elevation, bearing = math.atan2(z, distance), math.atan2(y, x) - yaw
-    return any(f.outside(bearing, edge) <= 0.0 and edge - f.down <= elevation + math.atan(
+    return any(f.angle_outside(bearing, edge) <= 0.0 and edge - f.down <= elevation + math.atan(
         forward * math.cos(f.heading) / GRAVITY) <= f.up - edge for f in view)
 
 
@@ -125,7 +125,7 @@ def vertical(view: View, bearing: float) -> tuple[float, float]:
 
     :param bearing: from the forward axis, rad.
     """
-    off = [f.outside(bearing) for f in view]
+    off = [f.angle_outside(bearing) for f in view]
     seeing = [f for f, outside in zip(view, off) if outside <= min(off)]
     return max(f.up for f in seeing), max(f.down for f in seeing)
 
@@ -161,7 +161,7 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
         return None if n is None else before
     missed = sum(stamp > n.stamp + _SAME for stamp in frames)
     if before is None:
-        offset = at(n, me.stamp).position - me.position
+        offset = propagate(n, me.stamp).position - me.position
         lost = missed >= IMAGES and visible(view, offset, me.yaw, forward, OCCLUSION_MARGIN)
         return Occlusion(n.stamp) if lost else None
     if missed >= IMAGES:

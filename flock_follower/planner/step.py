@@ -40,15 +40,15 @@ from flock_follower.planner.guard import (
     retreat,
     retreat_velocity,
 )
-from flock_follower.planner.inputs import at, Neighbor, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.limits import SEPARATION
-from flock_follower.planner.memory import ingest, Memory
-from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
+from flock_follower.planner.memory import ingest, Memory, update_pending
+from flock_follower.planner.modes import blind, next_state, odometry_delay, odometry_fault, State
 from flock_follower.planner.neighborhood import last_known, nominal, reports
 from flock_follower.planner.params import AVOID, PlannerParams
-from flock_follower.planner.scene import awaited, Decision, Scene, survey
+from flock_follower.planner.scene import Decision, expected_now, Scene, survey
 from flock_follower.planner.sight import Occlusion, occlusion, View
-from flock_follower.planner.vertical_yaw import Altitude, facing, searching, turning
+from flock_follower.planner.vertical_yaw import Altitude, face_yaw, search_yaw, turn_rate
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
@@ -81,7 +81,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     if memory.own is None or memory.given_up or odometry_fault(memory.own, now, params):
         memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
         return memory, Decision(state, reason, rejected=rejected)
-    me, tracking = at(memory.own, now), state is State.TRACK
+    me, tracking = propagate(memory.own, now), state is State.TRACK
     # Velocity that was commanded and flown since the measurement, m/s; the rest is pending.
     flown = memory.pending * (max(now - memory.own.stamp, 0.0) / params.response_time)
     memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
@@ -90,25 +90,23 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     velocity = me.velocity + flown + memory.pending
     unlimited, fading = nominal(memory, state, me, velocity, neighbors, params)
     command = constrain(unlimited, vertical, altitude.climb, memory, scene, velocity, view, params)
-    if me.stamp - memory.switched < relative.SETTLING:
+    if me.stamp - memory.switched < relative.SETTLING_TIME:
         command = command._replace(
             acceleration=relative.without_step(command.acceleration, memory.command))
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, memory, scene, params, elapsed)
     stamp = newest if tracking else (
         memory.followed if state is State.COAST and SEPARATION in command.reason else None)
-    left = math.exp(-elapsed / params.response_time)
     memory = memory._replace(
         followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
         shares=neighbors.shares, edges=neighbors.edges,
         faced=neighbors.faced.name if neighbors.faced else memory.faced,
         leader=last_known(memory, neighbors), looking=scene.leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
-        pending=left * memory.pending + (1.0 - left) * params.response_time * (
-            command.acceleration))
+        pending=update_pending(memory, command.acceleration, elapsed, params))
     return memory, Decision(
         state, reason, command.acceleration, yaw,
-        turning(last_yaw, yaw, me, params, elapsed), command.separation_axis,
+        turn_rate(last_yaw, yaw, me, params, elapsed), command.separation_axis,
         retreat_velocity(memory, scene, params), stamp,
         command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
@@ -124,7 +122,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     neighbor was followed for too long; it then sends no commands.
     """
     fault = odometry_fault(memory.own, now, params)
-    occluded = None if fault else _occluded(memory, now, frames, view)
+    occluded = None if fault else _judge_occlusion(memory, now, frames, view)
     follow = [n for n in memory.neighbors.values() if n.member.role != AVOID and (
         occluded is None or n.received or n.name != memory.faced)]
     seen, received = (max((n.stamp for n in follow if n.received is by_message), default=None)
@@ -134,7 +132,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     given_up = memory.given_up or (
         now - begun if unfollowed is None else unfollowed) > params.resume_timeout
     state, reason = next_state(
-        engaged, fault or late(memory.own, now, params) or blinded,
+        engaged, fault or odometry_delay(memory.own, now, params) or blinded,
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
         None if received is None else now - received, occluded is not None)
     if state is not State.IDLE:
@@ -142,11 +140,12 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     return memory, state, reason, received if seen is None else seen
 
 
-def _occluded(memory: Memory, now: float, frames: Sequence[float], view: View) -> Occlusion | None:
+def _judge_occlusion(memory: Memory, now: float, frames: Sequence[float],
+                     view: View) -> Occlusion | None:
     """Return whether the faced neighbor is occluded."""
     if memory.own is None or memory.followed is None:
         return None
-    me = at(memory.own, now)
+    me = propagate(memory.own, now)
     n = memory.neighbors.get(memory.faced) or memory.flock.get(memory.faced)
     sent = np.zeros(3) if memory.command is None else memory.command
     forward = math.cos(me.yaw) * sent[0] + math.sin(me.yaw) * sent[1]
@@ -167,23 +166,23 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,
     me, coming = me._replace(velocity=me.velocity + flown), float(memory.pending[2])
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
-    altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
+    altitude = memory.altitude or Altitude.begin(me, None if jumped else ground, params)
     level = neighbors.level
     if level is None and missed is not None and not scene.blinded:
-        level = awaited(missed, memory, me.stamp, params)
+        level = expected_now(missed, memory, me.stamp, params)
         if level.stamp < me.stamp:
             level = level._replace(velocity=np.zeros(3), acceleration=None)
-    altitude = altitude.following(
+    altitude = altitude.follow(
         level if params.altitude_mode == 'follow' else None, params, elapsed)
     if not params.guard:
-        return altitude.controlled(me, params, coming=coming)
-    near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
+        return altitude.control(me, params, coming=coming)
+    near = neighbors.flock or [propagate(n, me.stamp) for n in memory.flock.values()
                                if me.stamp - n.stamp <= params.coast_timeout]
     raised = -math.inf
     if memory.lost is not None and not scene.blinded:
         # The climb lasts as long as the loss: the next one begins at the altitude held before.
         raised = min(overflight(memory.lost, me.position, altitude.held, params), altitude.highest)
-    return altitude.controlled(
+    return altitude.control(
         me, params, *climb_range(near, me, params), coming, raised)
 
 
@@ -195,12 +194,12 @@ def _yaw(last: float, memory: Memory, scene: Scene, params: PlannerParams,
         return last
     if missed is not None:
         since = me.stamp - missed.stamp - params.coast_timeout
-        there = awaited(missed, memory, me.stamp, params)
-        return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
+        there = expected_now(missed, memory, me.stamp, params)
+        return face_yaw(last, me, there, params, elapsed) if since <= 0.0 else search_yaw(
             last, me, there, since, params, elapsed)
     if faced is not None:
         # Seen again during a turn: the yaw commanded last is where it would overshoot to.
-        return facing(me.yaw if memory.params is None else last, me, faced, params, elapsed)
+        return face_yaw(me.yaw if memory.params is None else last, me, faced, params, elapsed)
     if scene.state is State.SEARCH:  # it looks round, anticlockwise
         return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
     return last
@@ -214,7 +213,7 @@ def _warnings(memory: Memory, scene: Scene, reason: str,
         search = '' if leader is None else (
             f'looks for {leader.name}, last known {me.stamp - leader.stamp:.1f} s ago')
         return (*filter(None, [reason, search]), *reports(memory, scene.neighbors, params))
-    retreated = 0.0 if memory.lost is None else memory.lost.retreated(me.position)
+    retreated = 0.0 if memory.lost is None else memory.lost.retreat_distance(me.position)
     if memory.lost is None or retreated < retreat(memory.lost, params) - 0.05:
         return ()
     return (f'moved {retreated:.1f} m out of the way of a neighbor out of sight: no further '

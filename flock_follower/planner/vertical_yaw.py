@@ -15,7 +15,7 @@
 """
 Altitude and yaw control: the altitude to hold, the vertical acceleration and the yaw.
 
-The altitude to hold follows that of the nearest neighbour, because a camera that looks ahead
+The altitude to hold follows that of the nearest neighbor, because a camera that looks ahead
 loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
 (s + w)^2, critically damped. The gate offsets an error of the hover thrust.
 
@@ -23,7 +23,7 @@ The vehicle stops in time before the lowest and the highest altitude: the nearer
 command acts, the slower it may approach them. A target that ends there is not enough: the vehicle
 overshot it by 0.25 m, because of the target's climb and of commands not yet flown.
 
-The neighbour's vertical velocity is smoothed, without lag if its acceleration is known. A
+The neighbor's vertical velocity is smoothed, without lag if its acceleration is known. A
 velocity v as small as its noise counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, as
 after a loss, is reduced slowly: with the delay of the vehicle, a fast climb overshoots ``v_max``.
 
@@ -40,7 +40,7 @@ from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATI
 from flock_follower.planner.params import PlannerParams
 
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
-CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
+CLIMB_NOISE = 0.1  # m/s: a neighbor's vertical velocity below this is mostly noise
 CLIMB_GAIN = 0.3  # share of a change in it that is used at once if its acceleration is known
 HEIGHT_GAIN = 0.5  # likewise of a change in its height
 CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
@@ -64,10 +64,10 @@ class Altitude(NamedTuple):
     commanded: float = math.nan
     """The altitude that the command leads to, m; NaN while neighbors limit the climb."""
     neighbor_climb: float | None = None
-    """Vertical velocity of the neighbour that is followed, m/s; None without one."""
+    """Vertical velocity of the neighbor that is followed, m/s; None without one."""
 
     @classmethod
-    def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
+    def begin(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
         """
         Return the altitude at which the planner becomes active, to hold.
 
@@ -79,9 +79,9 @@ class Altitude(NamedTuple):
         return cls(z, min(ground + params.altitude_min + ALTITUDE_MARGIN, z),
                    max(ground + params.altitude_max - ALTITUDE_MARGIN, z))
 
-    def following(self, leader: Neighbor | None, params: PlannerParams,
+    def follow(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
-        """Return the altitude after ``elapsed`` s of following a neighbour."""
+        """Return the altitude after ``elapsed`` s of following a neighbor."""
         if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
         goal = float(leader.position[2]) + params.altitude_offset
@@ -106,7 +106,7 @@ class Altitude(NamedTuple):
                     max(self.climb, significant) + faster)
         return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
 
-    def controlled(self, me: OwnState, params: PlannerParams, least: float = -math.inf,
+    def control(self, me: OwnState, params: PlannerParams, least: float = -math.inf,
                    most: float = math.inf, coming: float = 0.0, raised: float = -math.inf
                    ) -> tuple[Altitude, float]:
         """
@@ -143,7 +143,7 @@ def _stopped_within(gap: float, gain: float) -> float:
     """
     Return the speed, m/s, from which it stops within a gap, m; beyond a bound, the return speed.
 
-    :param gain: speed for each metre, 1/s, while the deceleration is at most BRAKING; farther away
+    :param gain: speed for each meter, 1/s, while the deceleration is at most BRAKING; farther away
         the deceleration is BRAKING.
     """
     near = BRAKING / gain ** 2
@@ -154,33 +154,33 @@ def _stopped_within(gap: float, gain: float) -> float:
 
 YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75
 YAW_LEAD = 0.4  # s: in which a vehicle turns to 63 % of a commanded yaw
-OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
+OVERHEAD_DISTANCE = 0.1  # m: closer than this horizontally, the direction to a neighbor is noise
 LOOK_ASIDE = 0.8  # rad to either side of the place of the loss, before looking all round
 WIDER = 1.4  # times as far to the other side, until the turn is complete
 LOOK_THERE = 0.5  # s for which the vehicle faces that place first
 
 
-def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
-           elapsed: float) -> float:
-    """Return the yaw that turns from the last one to the place where a neighbour will soon be."""
+def face_yaw(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
+             elapsed: float) -> float:
+    """Return the yaw that turns from the last one to the place where a neighbor will soon be."""
     x, y, _ = (neighbor.position - me.position).tolist()
     distance = math.hypot(x, y)
-    if distance < OVERHEAD:
+    if distance < OVERHEAD_DISTANCE:
         return last
     vx, vy, _ = (neighbor.velocity - me.velocity).tolist()
     passing = (x * vy - y * vx) / distance ** 2  # rad/s
     ahead = YAW_LEAD * min(max(passing, -params.yaw_rate_max), params.yaw_rate_max)
-    return _turned(last, math.atan2(y, x) + ahead, params, elapsed)
+    return _turn_toward(last, math.atan2(y, x) + ahead, params, elapsed)
 
 
-def searching(last: float, me: OwnState, there: Neighbor, since: float, params: PlannerParams,
-              elapsed: float) -> float:
+def search_yaw(last: float, me: OwnState, there: Neighbor, since: float, params: PlannerParams,
+               elapsed: float) -> float:
     """
-    Return the yaw towards the place where a neighbour is expected, to both sides, then all round.
+    Return the yaw towards the place where a neighbor is expected, to both sides, then all round.
 
-    The first side is the one to which the neighbour moved.
+    The first side is the one to which the neighbor moved.
 
-    :param there: the neighbour where it is expected; :param since: time of the search, s.
+    :param there: the neighbor where it is expected; :param since: time of the search, s.
     """
     x, y, _ = there.position - me.position
     left = params.scan_rate * max(since - LOOK_THERE, 0.0)
@@ -189,11 +189,11 @@ def searching(last: float, me: OwnState, there: Neighbor, since: float, params: 
         left -= abs(end - aside)
         aside, end = end, -WIDER * end
     aside += math.copysign(left, end - aside)
-    return _turned(last, math.atan2(y, x) + aside, params, elapsed)
+    return _turn_toward(last, math.atan2(y, x) + aside, params, elapsed)
 
 
-def turning(before: float, commanded: float, me: OwnState, params: PlannerParams,
-            elapsed: float) -> float:
+def turn_rate(before: float, commanded: float, me: OwnState, params: PlannerParams,
+              elapsed: float) -> float:
     """
     Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
 
@@ -207,6 +207,6 @@ def turning(before: float, commanded: float, me: OwnState, params: PlannerParams
     return min(max(rate, -params.yaw_rate_max), params.yaw_rate_max)
 
 
-def _turned(last: float, goal: float, params: PlannerParams, elapsed: float) -> float:
+def _turn_toward(last: float, goal: float, params: PlannerParams, elapsed: float) -> float:
     most = params.yaw_rate_max * elapsed
     return wrap_angle(last + min(max(wrap_angle(goal - last), -most), most))

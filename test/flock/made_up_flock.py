@@ -27,7 +27,7 @@ import math
 
 import numpy as np
 
-from flock_follower.flock.alignment import Frame, turned
+from flock_follower.flock.alignment import Frame, yaw_rotation
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, quaternion_from_yaw, wrap_angle
 from flock_follower.messages import NANOSECONDS, OdometryState, to_nanoseconds
@@ -159,7 +159,7 @@ class MadeUpFlock:
         self.turn = self.turn + math.radians(0.1) * math.sqrt(STEP) * rng.normal(size=count)
         walk = 0.02 * math.sqrt(STEP) * rng.normal(size=(count, 3))
         for k in range(count):
-            self.odometry[k] += turned(self.turn[k]) @ (true[k] - self.true[k]) + walk[k]
+            self.odometry[k] += yaw_rotation(self.turn[k]) @ (true[k] - self.true[k]) + walk[k]
         self.true = true
         self.history.append((true, self.odometry.copy(), self.turn.copy()))
         for k, name in enumerate(self.names[1:], 1):
@@ -179,7 +179,7 @@ class MadeUpFlock:
         pose[:3, :3] = position_variance * np.eye(3)
         pose[3:, 3:] = yaw_variance * np.eye(3)
         twist[:3, :3] = 0.05 ** 2 * np.eye(3)
-        turn = turned(self.turn[k])
+        turn = yaw_rotation(self.turn[k])
         velocity = turn @ self.velocity(of, time) + 0.03 * self.rng.normal(size=3)
         yaw = self.yaw(of, time) + self.turn[k] + yaw_error
         return OdometryState(self.stamp(time, self.names[k]), 'odom', child, place,
@@ -192,7 +192,7 @@ class MadeUpFlock:
             return
         true, odometry, turn = self.history[-1 - LATE]
         for of in self.sees[k]:
-            place = odometry[k] + turned(turn[k]) @ (true[of] - true[k])
+            place = odometry[k] + yaw_rotation(turn[k]) @ (true[of] - true[k])
             place = place + self._sight_error(k, of)
             self.sharing[name].take_seen(self.state(
                 k, self.names[of], of, place, self.time - LATE * STEP, how.sight_std ** 2,
@@ -229,7 +229,7 @@ class MadeUpFlock:
     def relative(self, k: int, of: int, step: int, at: int | None = None) -> Array:
         """Return where a vehicle is in k's odometry at a step, which is k's own of ``at``."""
         true, odometry, turn = self.history[step if at is None else at]
-        return odometry[k] + turned(turn[k]) @ (self.history[step][0][of] - true[k])
+        return odometry[k] + yaw_rotation(turn[k]) @ (self.history[step][0][of] - true[k])
 
     def _judge(self, k: int, name: str, reported: list[OdometryState]) -> None:
         last = len(self.history) - 1
@@ -254,8 +254,8 @@ class MadeUpFlock:
 
     def misfit(self, k: int, j: int, frame: Frame) -> float:
         """Return chi^2 (4 degrees of freedom) of a frame's alignment."""
-        world = self.true[j] + turned(-self.turn[j]) @ (frame.anchor - self.odometry[j])
-        place = self.odometry[k] + turned(self.turn[k]) @ (world - self.true[k])
+        world = self.true[j] + yaw_rotation(-self.turn[j]) @ (frame.anchor - self.odometry[j])
+        place = self.odometry[k] + yaw_rotation(self.turn[k]) @ (world - self.true[k])
         error = np.array([wrap_angle(frame.yaw - (self.turn[k] - self.turn[j])),
                           *(frame.place - place)])
         return float(error @ np.linalg.solve(frame.covariance, error))

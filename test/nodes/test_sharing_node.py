@@ -23,7 +23,7 @@ from driven import Driven, overrides, to_odometry
 import numpy as np
 import pytest
 
-from flock_follower.flock.alignment import turned
+from flock_follower.flock.alignment import yaw_rotation
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.messages import to_array
 from flock_follower.nodes.flock import SHARED_TOPIC, SharingNode
@@ -39,7 +39,7 @@ KNOWN = 1e-4 * np.eye(6)
 def place(name: str, of: str) -> Array:
     """Return where a vehicle is in the odometry of another, or in its own."""
     yaw, origin = FRAMES[name]
-    return turned(yaw) @ TRUE[of] + origin
+    return yaw_rotation(yaw) @ TRUE[of] + origin
 
 
 class Flock:

@@ -33,7 +33,7 @@ TOLERANCE = 1e-9
 def holds(point: complex, sides: Sequence[Side], discs: Discs) -> bool:
     """Return whether a point is within all bounds and both discs, but for rounding."""
     return all(product(normal, point) >= least - TOLERANCE for normal, least in sides) and all(
-        abs(point - centre) <= radius + TOLERANCE for centre, radius in (discs[:2], discs[2:]))
+        abs(point - center) <= radius + TOLERANCE for center, radius in (discs[:2], discs[2:]))
 
 
 def corners(sides: Sequence[Side], discs: Discs) -> Iterator[complex]:
@@ -42,30 +42,30 @@ def corners(sides: Sequence[Side], discs: Discs) -> Iterator[complex]:
         cross = (one.conjugate() * other).imag
         if abs(cross) > 1e-6 * abs(one) * abs(other):
             yield -1j * (level * other - other_level * one) / cross
-    for centre, radius in (discs[:2], discs[2:]):
+    for center, radius in (discs[:2], discs[2:]):
         for normal, least in sides:
-            offset = (least - product(normal, centre)) / abs(normal)
-            yield from chord(centre, normal / abs(normal), offset, radius)
-    (centre, radius), (other, other_radius) = discs[:2], discs[2:]
-    if distance := abs(other - centre):
+            offset = (least - product(normal, center)) / abs(normal)
+            yield from chord(center, normal / abs(normal), offset, radius)
+    (center, radius), (other, other_radius) = discs[:2], discs[2:]
+    if distance := abs(other - center):
         along = (distance + (radius - other_radius) * (radius + other_radius) / distance) / 2.0
-        yield from chord(centre, (other - centre) / distance, along, radius)
+        yield from chord(center, (other - center) / distance, along, radius)
 
 
-def chord(centre: complex, axis: complex, along: float, radius: float) -> Iterator[complex]:
-    """Yield the points of a circle at a distance from its centre along an axis, if any."""
+def chord(center: complex, axis: complex, along: float, radius: float) -> Iterator[complex]:
+    """Yield the points of a circle at a distance from its center along an axis, if any."""
     square = radius ** 2 - along ** 2
     if square > -TOLERANCE * max(radius, 1.0):
         for side in (1j, -1j):
-            yield centre + axis * (along + side * math.sqrt(max(square, 0.0)))
+            yield center + axis * (along + side * math.sqrt(max(square, 0.0)))
 
 
 def nearest(goal: complex, sides: Sequence[Side], discs: Discs) -> complex | None:
     """Return the point within all bounds that is nearest to a goal, or None."""
     feet = [goal + (least - product(normal, goal)) / abs(normal) ** 2 * normal
             for normal, least in sides]
-    rims = [centre + radius * (goal - centre) / (abs(goal - centre) or 1.0)
-            for centre, radius in (discs[:2], discs[2:])]
+    rims = [center + radius * (goal - center) / (abs(goal - center) or 1.0)
+            for center, radius in (discs[:2], discs[2:])]
     return min((point for point in (goal, *feet, *rims, *corners(sides, discs))
                 if holds(point, sides, discs)), key=lambda point: abs(point - goal), default=None)
 
@@ -73,7 +73,7 @@ def nearest(goal: complex, sides: Sequence[Side], discs: Discs) -> complex | Non
 def farthest(direction: complex, sides: Sequence[Side], discs: Discs) -> complex | None:
     """Return a point within all bounds that is farthest in a direction, or None."""
     unit = direction / abs(direction)
-    rims = [centre + radius * unit for centre, radius in (discs[:2], discs[2:])]
+    rims = [center + radius * unit for center, radius in (discs[:2], discs[2:])]
     return max((point for point in (*rims, *corners(sides, discs)) if holds(point, sides, discs)),
                key=lambda point: product(direction, point), default=None)
 

@@ -52,7 +52,7 @@ def leader(z: float, climb: float = 0.0, rising: float | None = None) -> Neighbo
 def followed(altitude: Altitude, it: Neighbor | None, seconds: float,
              params: PlannerParams = PARAMS) -> Altitude:
     for _ in range(round(seconds / PERIOD)):
-        altitude = altitude.following(it, params, PERIOD)
+        altitude = altitude.follow(it, params, PERIOD)
     return altitude
 
 
@@ -65,11 +65,11 @@ def flown(seconds: float, leads: Callable[[float], tuple[float, float]] = lambda
     :param leads: height and climb of the leader at a time; :param first: own height at first.
     :param late: periods after which a command is flown.
     """
-    altitude, height, speed = Altitude.begun(me(first), 0.0, params), first, 0.0
+    altitude, height, speed = Altitude.begin(me(first), 0.0, params), first, 0.0
     waiting = [0.0] * late
     for tick in range(round(seconds / PERIOD)):
-        altitude = altitude.following(leader(*leads(tick * PERIOD)), params, PERIOD)
-        altitude, vertical = altitude.controlled(me(height, speed), params)
+        altitude = altitude.follow(leader(*leads(tick * PERIOD)), params, PERIOD)
+        altitude, vertical = altitude.control(me(height, speed), params)
         waiting.append(vertical)
         acting = waiting.pop(0)
         for _ in range(10):
@@ -86,19 +86,19 @@ def test_a_climb_as_small_as_its_noise_is_none_and_a_real_one_counts() -> None:
     params = replace(PARAMS, v_max=2.0)
     for climb, least, most in ((0.03, 0.0, 0.001), (-0.03, -0.001, 0.0), (0.2, 0.18, 0.201),
                                (-0.2, -0.201, -0.18), (0.7, 0.699, 0.701)):
-        altitude = Altitude.begun(me(20.0), 0.0, params)
+        altitude = Altitude.begin(me(20.0), 0.0, params)
         for _ in range(30):
             # At a height that is no news.
-            altitude = altitude.following(leader(altitude.held, climb), params, PERIOD)
-        altitude = altitude.following(
+            altitude = altitude.follow(leader(altitude.held, climb), params, PERIOD)
+        altitude = altitude.follow(
             leader(altitude.held + altitude.climb * PERIOD, climb), params, PERIOD)
         assert least <= altitude.climb <= most
 
 
 def test_an_absurd_acceleration_of_the_leader_does_no_harm() -> None:
-    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
+    altitude = Altitude.begin(me(2.0), 0.0, PARAMS)
     for _ in range(5):
-        altitude = altitude.following(leader(2.0, 0.0, 1e300), PARAMS, PERIOD)
+        altitude = altitude.follow(leader(2.0, 0.0, 1e300), PARAMS, PERIOD)
     assert abs(altitude.climb) <= PARAMS.climb_rate
     assert abs(altitude.held - 2.0) <= 5 * PERIOD * PARAMS.climb_rate
 
@@ -114,12 +114,12 @@ def test_after_a_loss_the_climb_begins_gently_and_does_not_overshoot() -> None:
 
 
 def test_without_a_leader_it_is_held() -> None:
-    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
+    altitude = Altitude.begin(me(2.0), 0.0, PARAMS)
     assert followed(altitude, None, 5.0) == altitude
 
 
 def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
-    low, high = (followed(Altitude.begun(me(3.0), 0.4, replace(PARAMS, altitude_max=6.0)),
+    low, high = (followed(Altitude.begin(me(3.0), 0.4, replace(PARAMS, altitude_max=6.0)),
                           leader(z), 30.0) for z in (-5.0, 50.0))
     assert (low.held, high.held) == pytest.approx((1.4 + ALTITUDE_MARGIN, 6.4 - ALTITUDE_MARGIN))
     assert (low.climb, high.climb) == pytest.approx((0.0, 0.0))
@@ -127,22 +127,22 @@ def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
 
 def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
     params = replace(PARAMS, altitude_max=3.0)
-    altitude = Altitude.begun(me(2.5), 0.0, params)
+    altitude = Altitude.begin(me(2.5), 0.0, params)
     for tick in range(60):
-        altitude = altitude.following(leader(2.5 + 0.02 * tick, 0.2), params, PERIOD)
+        altitude = altitude.follow(leader(2.5 + 0.02 * tick, 0.2), params, PERIOD)
         assert altitude.held <= 3.0
     assert (altitude.held, altitude.climb) == (
         pytest.approx(3.0 - ALTITUDE_MARGIN), pytest.approx(0.0, abs=1e-3))
 
 
 def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
-    altitude = Altitude.begun(me(0.6), 0.0, PARAMS)
+    altitude = Altitude.begin(me(0.6), 0.0, PARAMS)
     assert followed(altitude, leader(0.2), 10.0).held == 0.6
     assert followed(altitude, leader(1.8), 10.0).held == pytest.approx(1.8)
 
 
 def test_without_a_known_ground_it_does_not_go_below_where_it_began() -> None:
-    altitude = Altitude.begun(me(3.0), None, PARAMS)
+    altitude = Altitude.begin(me(3.0), None, PARAMS)
     assert followed(altitude, leader(1.0), 10.0).held == 3.0
 
 
@@ -153,7 +153,7 @@ def test_behind_a_leader_that_climbs_steadily_nothing_lags() -> None:
 
 @given(st.floats(-1e308, 1e308), st.floats(-50.0, 50.0), st.floats(-1e308, 1e308))
 def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held: float) -> None:
-    _, vertical = Altitude(held, 0.0, 10.0, 0.3).controlled(me(z, climb), PARAMS)
+    _, vertical = Altitude(held, 0.0, 10.0, 0.3).control(me(z, climb), PARAMS)
     assert abs(vertical) <= PARAMS.max_vertical_acceleration
 
 
@@ -163,7 +163,7 @@ def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held
     (-0.1, 1.6, -math.inf, 3.0)])
 def test_the_commanded_altitude_is_unknown_while_neighbors_limit_the_climb(
         least: float, most: float, raised: float, expected: float) -> None:
-    altitude, _ = Altitude(3.0, 0.0, 10.0).controlled(
+    altitude, _ = Altitude(3.0, 0.0, 10.0).control(
         me(2.5), PARAMS, least, most, raised=raised)
     assert altitude.commanded == pytest.approx(expected, nan_ok=True)
 

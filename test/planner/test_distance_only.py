@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A neighbour of which only the distance is known: kept clear of, never followed."""
+"""A neighbor of which only the distance is known: kept clear of, never followed."""
 
 from __future__ import annotations
 

@@ -27,9 +27,9 @@ import pytest
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.bounds import radial_bounds
-from flock_follower.planner.guard import ordered
+from flock_follower.planner.guard import sort_bounds
 from flock_follower.planner.limits import Bound, COHESION, limit_command, SEPARATION
-from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.params import EDGE_RETURN_SPEED, Edges, GuardParams
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
@@ -55,7 +55,7 @@ def pair(distance: float, normal: Array, lowest: float, highest: float = math.in
 
 
 def situation(seed: int, count: int) -> tuple[Array, Array, list[Bound]]:
-    """Return a command within the limits, a velocity, and neighbours in or near the band."""
+    """Return a command within the limits, a velocity, and neighbors in or near the band."""
     rng = np.random.default_rng(seed)
     v = rng.uniform(-0.4, 0.4, 3)
     a = limit_command(rng.uniform(-2.0, 2.0, 3), v, A_MAX, V_MAX, T).acceleration
@@ -75,7 +75,7 @@ def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
         a: Vector, v: Vector, around: list[tuple[Vector, Vector, Vector]], a_max: float,
         v_max: float, period: float) -> None:
     found = [each for p, w, its in around for each in bounds(p, w, its)]
-    command = guard(a, v, ordered(found), a_max, v_max, period)
+    command = guard(a, v, sort_bounds(found), a_max, v_max, period)
     assert np.all(np.isfinite(command.acceleration))
     assert np.linalg.norm(command.acceleration) <= a_max
     speed = math.hypot(*v)
@@ -88,7 +88,7 @@ def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
 @given(SEED, st.integers(1, 3))
 def test_near_the_band_the_vertical_part_stays(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
-    command = guard(a, v, ordered(around), A_MAX, V_MAX, T)
+    command = guard(a, v, sort_bounds(around), A_MAX, V_MAX, T)
     assert command.acceleration[2] == pytest.approx(a[2], abs=1e-9)
 
 
@@ -96,7 +96,7 @@ def test_near_the_band_the_vertical_part_stays(seed: int, count: int) -> None:
 def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
     around = [b for b in around if b.normal @ a >= b.least]
-    command = guard(a, v, ordered(around), A_MAX, V_MAX, T)
+    command = guard(a, v, sort_bounds(around), A_MAX, V_MAX, T)
     assert command.acceleration.tobytes() == a.tobytes()
     assert command.reason == ''
 
@@ -107,7 +107,7 @@ def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_m
     a, v, _ = situation(seed, 0)
     rng = np.random.default_rng(seed)
     one = bounds([*rng.uniform(-2.0, 2.0, 2), 0.0], rng.uniform(-0.5, 0.5, 3))
-    level = guard(a, v, ordered(one), A_MAX, 100.0, T).acceleration[:2]
+    level = guard(a, v, sort_bounds(one), A_MAX, 100.0, T).acceleration[:2]
     n, most = np.array(one[0].normal[:2]), math.sqrt(A_MAX ** 2 - a[2] ** 2)
     lowest, highest = np.clip([one[0].least, -one[1].least], -most, most)
     radial = np.clip(n @ a[:2], lowest, highest)
@@ -125,7 +125,7 @@ def test_at_v_max_the_radial_part_comes_first(seed: int) -> None:
     v = np.array([0.0, 0.5, 0.0])  # sideways, at v_max
     lowest = rng.uniform(0.1, 2.2)
     a = limit_command([0.0, rng.uniform(0.0, 1.0), 0.0], v, A_MAX, V_MAX, T).acceleration
-    one = ordered(pair(1.1, n, lowest, 9.0))
+    one = sort_bounds(pair(1.1, n, lowest, 9.0))
     command = guard(a, v, one, A_MAX, V_MAX, T).acceleration
     assert n @ command == pytest.approx(lowest)
     assert np.linalg.norm(v + command * T) == pytest.approx(V_MAX)
@@ -134,7 +134,7 @@ def test_at_v_max_the_radial_part_comes_first(seed: int) -> None:
 def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows() -> None:
     x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     around = [*pair(1.2, -x, 1.0, 9.0), *pair(1.3, y, 2.5, 9.0), *pair(1.1, x, 1.5, 9.0)]
-    command = guard(np.zeros(3), np.zeros(3), ordered(around), A_MAX, 9.0, T)
+    command = guard(np.zeros(3), np.zeros(3), sort_bounds(around), A_MAX, 9.0, T)
     assert command.acceleration == pytest.approx([1.5, 2.0, 0.0], abs=1e-6)
     assert command.reason == 'separation'
 
@@ -142,26 +142,26 @@ def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows
 def test_who_is_seen_comes_before_who_is_only_supposed_to_be_somewhere_nearer() -> None:
     x = np.array([1.0, 0.0, 0.0])
     around = [*pair(0.1, x, 1.5, seen=False), *pair(1.1, -x, 1.0, 9.0)]
-    command = guard(np.zeros(3), np.zeros(3), ordered(around), A_MAX, V_MAX, T).acceleration
+    command = guard(np.zeros(3), np.zeros(3), sort_bounds(around), A_MAX, V_MAX, T).acceleration
     assert command[0] == pytest.approx(-1.0, abs=1e-6)
 
 
 def test_cohesion_against_separation_does_not_push_across() -> None:
     behind, ahead = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.01, 0.0])
     around = [Bound(behind, 0.3, SEPARATION, 1.8), Bound(ahead, 0.2, COHESION, 2.6)]
-    command = guard(np.zeros(3), np.zeros(3), ordered(around), A_MAX, 9.0, T).acceleration
+    command = guard(np.zeros(3), np.zeros(3), sort_bounds(around), A_MAX, 9.0, T).acceleration
     assert command == pytest.approx([-0.3, 0.0, 0.0], abs=1e-6)
 
 
 @given(st.floats(0.0, 10.0), st.floats(0.05, 5.0), st.floats(0.1, 10.0))
 def test_the_closing_speed_is_stopped_within_the_gap(gap: float, tau: float, b: float) -> None:
-    speed = GuardParams(tau=tau, b=b).closing(gap)[0]
+    speed = GuardParams(tau=tau, b=b).closing_speed(gap)[0]
     assert speed * tau + speed ** 2 / (2.0 * b) == pytest.approx(gap, abs=1e-9)
 
 
 def test_beyond_the_margin_the_distance_returns_slowly() -> None:
-    assert PARAMS.closing(-0.1)[0] == pytest.approx(-0.2)
-    assert PARAMS.closing(-1.0)[0] == -EDGE_RETURN_SPEED
+    assert PARAMS.closing_speed(-0.1)[0] == pytest.approx(-0.2)
+    assert PARAMS.closing_speed(-1.0)[0] == -EDGE_RETURN_SPEED
 
 
 def test_bounds_are_those_of_the_formula() -> None:
@@ -169,7 +169,7 @@ def test_bounds_are_those_of_the_formula() -> None:
     lower, upper = bounds(p, w, its)
     near, far = 1.5 - 1.0 - PARAMS.m, math.sqrt(8.0) - PARAMS.m - 1.5
     common, rate = -0.5 - 0.4 ** 2 / 1.5, -0.3
-    (speed, slope), (far_speed, far_slope) = PARAMS.closing(near), PARAMS.closing(far)
+    (speed, slope), (far_speed, far_slope) = PARAMS.closing_speed(near), PARAMS.closing_speed(far)
     assert lower.least == pytest.approx(common - (rate + speed) / PARAMS.T_g - slope * rate)
     assert -upper.least == pytest.approx(
         common - (rate - far_speed) / PARAMS.T_g - far_slope * rate)
@@ -195,7 +195,7 @@ def test_the_margin_leaves_room_in_a_narrow_band() -> None:
 
 def test_a_leader_overhead_is_not_fled_from_sideways_at_random() -> None:
     above = bounds((0.001, 0.0, -0.9), (0.0, 0.0, 0.0))
-    command = guard(np.zeros(3), np.zeros(3), ordered(above), A_MAX, V_MAX, T)
+    command = guard(np.zeros(3), np.zeros(3), sort_bounds(above), A_MAX, V_MAX, T)
     assert np.array_equal(command.acceleration, np.zeros(3))
 
 

@@ -24,8 +24,8 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.planner.bounds import radial_bounds
-from flock_follower.planner.guard import ordered
-from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.guard import sort_bounds
+from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.params import EDGE_RETURN_SPEED, Edges, GuardParams
 
 PARAMS = GuardParams()
@@ -63,7 +63,7 @@ def least_gap(unknown: float, delay: float, velocity_error: float, range_error: 
         reported = distance + side * range_error
         closing = rate + side * velocity_error - pending
         found = radial_bounds(-reported * AHEAD, -closing * AHEAD, BAND, PARAMS)
-        queue.append(guard(side * 5.0 * AHEAD, np.zeros(3), ordered(found), 20.0, 90.0,
+        queue.append(guard(side * 5.0 * AHEAD, np.zeros(3), sort_bounds(found), 20.0, 90.0,
                            PERIOD).acceleration)
         acceleration = queue.popleft()
         for _ in range(STEPS):

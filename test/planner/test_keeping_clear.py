@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Downwash, fences and neighbours out of sight: their bounds, flown by a point."""
+"""Downwash, fences and neighbors out of sight: their bounds, flown by a point."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from flock_follower.planner.bounds import in_sight
 from flock_follower.planner.guard import (
     climb_range,
     fences,
-    ordered,
+    limit_to_retreat,
     overflight,
     retreat,
     RETREAT_TIME,
-    retreating,
+    sort_bounds,
 )
-from flock_follower.planner.inputs import Expected, Neighbor
+from flock_follower.planner.inputs import Neighbor, Prediction
 from flock_follower.planner.limits import Bound, LimitedCommand
-from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import Member, PlannerParams
-from flock_follower.planner.scene import beside
+from flock_follower.planner.scene import across_path
 
 PARAMS = PlannerParams(v_max=2.0)
 AHEAD = np.array([1.0, 0.0, 0.0])
 
 
-def expected(position: Array, spread: float = 0.0, spreading: float = 0.0) -> Expected:
-    return Expected(position.tolist(), STILL, STILL, spread, spreading, STILL)
+def expected(position: Array, spread: float = 0.0, spreading: float = 0.0) -> Prediction:
+    return Prediction(position.tolist(), STILL, STILL, spread, spreading, STILL)
 
 
 def pushed(bounds: Callable[[Array, Array], list[Bound]], pull: float = 2.0,
@@ -68,7 +68,7 @@ def pushed(bounds: Callable[[Array, Array], list[Bound]], pull: float = 2.0,
 def test_no_vehicle_flies_above_or_below_another(height: float) -> None:
     """Drawn towards it as hard as it can, it stays beside it, whatever the height."""
     leader = np.array([3.0, 0.1, height])
-    for position, _ in pushed(lambda p, v: ordered(
+    for position, _ in pushed(lambda p, v: sort_bounds(
             in_sight(expected(leader), p, v, True, True, PARAMS))):
         assert math.dist(leader[:2], position[:2]) >= 0.9 * math.sqrt(PARAMS.law.d0)
 
@@ -81,9 +81,9 @@ def test_out_of_sight_it_moves_away_no_farther_than_the_retreat() -> None:
     found, = in_sight(it, np.zeros(3), np.zeros(3), False, False, PARAMS)
     assert found.normal == pytest.approx(-np.array([1.5, 0.4, 0.0]) / math.hypot(1.5, 0.4))
     assert not found.seen and found.least > PARAMS.a_max
-    assert retreating(found, LOST, np.zeros(3), np.zeros(3), PARAMS).least > 1.0
+    assert limit_to_retreat(found, LOST, np.zeros(3), np.zeros(3), PARAMS).least > 1.0
     there = -PARAMS.retreat_max * AHEAD
-    assert retreating(found, LOST, there, np.zeros(3), PARAMS).least <= 0.0
+    assert limit_to_retreat(found, LOST, there, np.zeros(3), PARAMS).least <= 0.0
 
 
 @pytest.mark.parametrize(('approach', 'farther'), [
@@ -141,13 +141,13 @@ def test_the_path_that_it_leaves_is_the_one_to_come(y: float) -> None:
 
 @pytest.mark.parametrize(('offset', 'side'), [([-2.0, 0.3, 1.0], 1.0), ([-2.0, -0.3, 0.0], -1.0)])
 def test_the_side_of_a_path_is_its_own(offset: list[float], side: float) -> None:
-    found = beside(np.array([-1.0, 0.0, 0.5]), np.array(offset))
+    found = across_path(np.array([-1.0, 0.0, 0.5]), np.array(offset))
     assert found == pytest.approx([0.0, side, 0.0])
-    assert beside(np.zeros(3), np.array(offset)) == pytest.approx(np.zeros(3))
+    assert across_path(np.zeros(3), np.array(offset)) == pytest.approx(np.zeros(3))
 
 
 def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
-    *_, (position, _) = pushed(lambda p, v: ordered(
+    *_, (position, _) = pushed(lambda p, v: sort_bounds(
         [], fences(LOST._replace(origin=p), p, v, PARAMS)), velocity=(0.5, 0.0, 0.0))
     assert position[0] == pytest.approx(2.0 - PARAMS.guarding.m, abs=0.05)
 
@@ -174,7 +174,7 @@ def test_the_climb_keeps_the_height_that_the_slant_distance_asks_for() -> None:
     level, height = 0.5, 0.8  # |r| = 0.94 m, less than sqrt(d0) = 1 m
     too_near = height - math.sqrt(1.0 - level ** 2)
     assert climb_range([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[
-        1] == pytest.approx(PARAMS.guarding.closing(too_near)[0])
+        1] == pytest.approx(PARAMS.guarding.closing_speed(too_near)[0])
 
 
 def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:

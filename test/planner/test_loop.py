@@ -124,7 +124,7 @@ def test_an_uncertain_place_is_not_followed_and_an_uncertain_attitude_is(
 
 
 @pytest.mark.parametrize(('std', 'known'), [(0.49, True), (0.51, False), (np.nan, False)])
-def test_the_yaw_of_a_neighbour_is_known_up_to_a_deviation(std: float, known: bool) -> None:
+def test_the_yaw_of_a_neighbor_is_known_up_to_a_deviation(std: float, known: bool) -> None:
     loop, covariance = engaged(), SURE.copy()
     covariance[5, 5] = std**2
     loop.take_odometry(own(START), START)
@@ -133,7 +133,7 @@ def test_the_yaw_of_a_neighbour_is_known_up_to_a_deviation(std: float, known: bo
     assert (loop.memory.neighbors['leader'].yaw is not None) == known
 
 
-def test_only_a_seen_neighbour_has_an_acceleration_and_the_faced_one_the_distance() -> None:
+def test_only_a_seen_neighbor_has_an_acceleration_and_the_faced_one_the_distance() -> None:
     loop = engaged()
     assert loop.distance() is None
     accelerates = leader(START)._replace(acceleration=np.array([0.3, 0.0, 0.0]))

@@ -26,7 +26,7 @@ import pytest
 
 from flock_follower.geometry import wrap_angle
 from flock_follower.planner.guard import retreat, RETREAT_TIME
-from flock_follower.planner.inputs import expected, FRESH
+from flock_follower.planner.inputs import FRESH, predict
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
@@ -75,8 +75,8 @@ def test_where_it_shall_not_retreat_it_stays(retreat_max: float, looked: float |
 def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
     n = seen(velocity=(0.3, 0.0, 0.0))
     ages = np.linspace(0.0, 5.0, 51)
-    spreads = np.array([expected(n, np.zeros(3), age, PARAMS).spread for age in ages])
-    rates = np.array([expected(n, np.zeros(3), age, PARAMS).spreading for age in ages])
+    spreads = np.array([predict(n, np.zeros(3), age, PARAMS).spread for age in ages])
+    rates = np.array([predict(n, np.zeros(3), age, PARAMS).spreading for age in ages])
     assert np.all(spreads[ages <= FRESH] == 0.0)  # the margin of the guard covers that
     assert np.gradient(spreads, ages)[10:-1] == pytest.approx(rates[10:-1], abs=0.06)
     assert rates[-1] == pytest.approx(PARAMS.leader_speed_max + 0.3)
@@ -90,7 +90,7 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
                                                          (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
 def test_an_acceleration_counts_as_far_as_it_is_more_than_noise(reported: float, least: float,
                                                                 most: float) -> None:
-    estimated = expected(seen(), np.array([0.0, -reported, 0.0]), 0.1, PARAMS).acceleration
+    estimated = predict(seen(), np.array([0.0, -reported, 0.0]), 0.1, PARAMS).acceleration
     assert least <= -estimated[1] <= most
     assert estimated[0] == estimated[2] == 0.0
 

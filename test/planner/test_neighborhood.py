@@ -23,11 +23,11 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.flock.neighbor_graph import HELD
+from flock_follower.flock.neighbor_graph import HELD_FACTOR
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.neighborhood import edges, gathered
+from flock_follower.planner.neighborhood import build_neighborhood, edges
 from flock_follower.planner.params import AVOID, FOLLOWER, LEADER, Member, PlannerParams
 
 PARAMS = PlannerParams()
@@ -78,8 +78,8 @@ def test_the_graph_is_connected_and_mutual_where_all_is_known(seed: int, count: 
         assert connected(joined) and mutual(joined)
 
 
-@pytest.mark.parametrize(('nearer', 'kept'), [(1.0, True), (HELD - 0.01, True),
-                                              (HELD + 0.01, False)])
+@pytest.mark.parametrize(('nearer', 'kept'), [(1.0, True), (HELD_FACTOR - 0.01, True),
+                                              (HELD_FACTOR + 0.01, False)])
 def test_an_edge_goes_when_another_is_clearly_nearer_to_both(nearer: float, kept: bool) -> None:
     far = at('far', 3.0, 0.0, 0.0)
     between = at('between', 1.5, ((3.0 / nearer) ** 2 - 2.25) ** 0.5, 0.0)
@@ -106,7 +106,7 @@ def test_beyond_the_band_no_edge_to_the_only_leader_in_sight_begins(
 def test_one_to_avoid_has_no_edge_and_removes_none() -> None:
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
     assert edges(set(), own(), flock, PARAMS) == {'leader'}
-    neighbors = gathered(Memory(), own(), flock, PARAMS, 0.1)
+    neighbors = build_neighborhood(Memory(), own(), flock, PARAMS, 0.1)
     assert neighbors.faced is flock[0] and neighbors.level is flock[0]
 
 
@@ -114,19 +114,19 @@ def test_one_to_avoid_has_no_edge_and_removes_none() -> None:
 def test_the_faced_neighbor_changes_for_one_clearly_nearer(before: str, expected: str) -> None:
     a, b, near = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0), at('c', -1.5, 0.0, 0.0)
     for flock, found in (([a, b], expected), ([a, b, near], 'c')):
-        faced = gathered(Memory(faced=before), own(), flock, PARAMS, 0.1).faced
+        faced = build_neighborhood(Memory(faced=before), own(), flock, PARAMS, 0.1).faced
         assert faced is not None and faced.name == found
 
 
 def test_in_a_column_it_faces_the_follower_ahead_and_not_the_leader_beyond() -> None:
     flock = [at('ahead', 1.8, 0.0, 0.0, role=FOLLOWER), at('leader', 3.0, 1.0, 0.0)]
-    faced = gathered(Memory(), own(), flock, PARAMS, 0.1).faced
+    faced = build_neighborhood(Memory(), own(), flock, PARAMS, 0.1).faced
     assert faced is not None and faced.name == 'ahead'
 
 
 def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
     def after(memory: Memory, *flock: Neighbor) -> Memory:
-        found = gathered(memory, own(), flock, PARAMS, 0.1)
+        found = build_neighborhood(memory, own(), flock, PARAMS, 0.1)
         return Memory(shares=found.shares, edges=found.edges)
 
     a, b, c = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 2.0, 0.0), at('c', -2.0, 0.0, 0.0)

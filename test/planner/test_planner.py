@@ -33,7 +33,7 @@ from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import FUTURE_TOLERANCE, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.modes import late, next_state, odometry_fault, State
+from flock_follower.planner.modes import next_state, odometry_delay, odometry_fault, State
 from flock_follower.planner.params import (
     ALTITUDE_MODES,
     AVOID,
@@ -542,4 +542,4 @@ FAST, SLOW, TOO_SLOW = (0.03,) * 20, (0.16,) * 20, (0.26,) * 20
     (0.02, TOO_SLOW, 'odometry too slow (0.26 s old before the next comes)')])
 def test_odometry_is_late_by_the_age_that_its_messages_usually_reach(
         age: float, ages: tuple[float, ...], reason: str) -> None:
-    assert late(own(1.0)._replace(ages=ages), 1.0 + age, PARAMS) == reason
+    assert odometry_delay(own(1.0)._replace(ages=ages), 1.0 + age, PARAMS) == reason

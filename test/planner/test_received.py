@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Received states of neighbours, used without a sighting, and the search for a lost leader."""
+"""Received states of neighbors, used without a sighting, and the search for a lost leader."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.relative import (
-    limited,
+    limit_relative,
     STEP_MAX,
 )
 from flock_follower.planner.step import step
@@ -113,7 +113,7 @@ def test_a_leader_that_stops_is_not_run_into():
        st.none() | st.tuples(*[st.floats(-0.5, 0.5)] * 3))
 def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     before = np.zeros(3) if last is None else np.array(last)
-    command = limited(np.array(level), vertical, last if last is None else before)
+    command = limit_relative(np.array(level), vertical, last if last is None else before)
     assert np.linalg.norm(command) <= RELATIVE_MAX + 1e-9
     assert np.linalg.norm(command - before) <= STEP_MAX + 1e-9
 

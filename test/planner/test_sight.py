@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The field of view: bounds that keep the neighbour in it, and occlusion; then it brakes."""
+"""The field of view: bounds that keep the neighbor in it, and occlusion; then it brakes."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ import pytest
 
 from flock_follower.geometry import Array, GRAVITY
 from flock_follower.planner.bounds import (
-    IN_LINE,
+    COLUMN_ANGLE,
     in_sight,
     MARKER_ANGLE,
     marker_bounds,
     sight_bounds,
 )
-from flock_follower.planner.guard import ordered
-from flock_follower.planner.inputs import Expected, Neighbor
-from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.guard import sort_bounds
+from flock_follower.planner.inputs import Neighbor, Prediction
+from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
 from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion, WIDEST
@@ -52,8 +52,8 @@ def info(k: list[float] = K, model: str = 'plumb_bob') -> SimpleNamespace:
 VIEW = FieldOfView.of_camera(info(), [0.0, 0.0, 0.0])
 
 
-def expected(position: Array, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Expected:
-    return Expected(position.tolist(), [*velocity], STILL, 0.0, 0.0, [*velocity])
+def expected(position: Array, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Prediction:
+    return Prediction(position.tolist(), [*velocity], STILL, 0.0, 0.0, [*velocity])
 
 
 def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
@@ -61,7 +61,7 @@ def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
     """Return what becomes of a command at rest, with only sight to keep."""
     it = expected(np.array(offset), its)
     bounds = sight_bounds(it.position, np.zeros(3), it, 0.0, (VIEW,), PARAMS)
-    return guard(np.array(wanted), np.zeros(3), ordered([], (), bounds), 5.0, PARAMS.v_max,
+    return guard(np.array(wanted), np.zeros(3), sort_bounds([], (), bounds), 5.0, PARAMS.v_max,
                  0.1).acceleration
 
 
@@ -120,7 +120,7 @@ def test_no_command_pitches_the_neighbor_out_of_the_image(bearing: float, distan
     assume(abs(math.atan2(height, distance)) < VIEW.up - 0.05)  # in sight when level
     a = commanded(tuple(wanted * forward), tuple(offset))
     pitched = math.atan2(height, distance) + math.atan2(float(forward @ a), GRAVITY)
-    # A nose that goes down lifts the neighbour in the image.
+    # A nose that goes down lifts the neighbor in the image.
     assert -VIEW.down <= pitched <= VIEW.up
 
 
@@ -145,13 +145,13 @@ def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with(side: float)
 
 def test_left_and_right_of_an_image_that_is_not_symmetric() -> None:
     view = FieldOfView(0.5, 0.3, 0.4, 0.4)
-    assert [view.outside(bearing) for bearing in (0.4, -0.2)] == [0.0, 0.0]
-    assert view.outside(0.6) == pytest.approx(0.1)
-    assert view.outside(-0.6) == pytest.approx(0.3)
+    assert [view.angle_outside(bearing) for bearing in (0.4, -0.2)] == [0.0, 0.0]
+    assert view.angle_outside(0.6) == pytest.approx(0.1)
+    assert view.angle_outside(-0.6) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize('side', [1.0, -1.0])
-@pytest.mark.parametrize(('role', 'widest'), [(LEADER, MARKER_ANGLE), (FOLLOWER, IN_LINE)])
+@pytest.mark.parametrize(('role', 'widest'), [(LEADER, MARKER_ANGLE), (FOLLOWER, COLUMN_ANGLE)])
 def test_it_moves_round_to_the_face_of_the_marker(side: float, role: str, widest: float) -> None:
     it = expected(np.array([2.0, 0.0, 0.0]))  # the marker is at its back
     (free,) = marker_bounds(it.position, np.zeros(3), it, side * 0.9 * widest, Member(role),
@@ -166,7 +166,7 @@ def test_separation_goes_before_sight() -> None:
     it = expected(np.array([0.9, 0.0, 0.5]))  # above, and too near: back, though it gets lost
     sight = sight_bounds(it.position, np.zeros(3), it, 0.0, (VIEW,), PARAMS)
     near = in_sight(it, np.zeros(3), np.zeros(3), True, True, PARAMS)
-    a = guard(np.zeros(3), np.zeros(3), ordered(near, (), sight), 5.0, PARAMS.v_max, 0.1)
+    a = guard(np.zeros(3), np.zeros(3), sort_bounds(near, (), sight), 5.0, PARAMS.v_max, 0.1)
     assert a.acceleration[0] < -1.0
     assert 'separation' in a.reason
 
