@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Finds the neighbours in images: camera model, markers, edges, poses, and a filter per neighbour.
+Finds the neighbors in images: camera model, markers, edges, poses, and a filter per neighbor.
 
 The only room of those that fly which uses cv2.
 """

@@ -15,7 +15,7 @@
 """
 Pinhole and fisheye cameras as ``sensor_msgs/CameraInfo`` describes them.
 
-Pixel coordinates are OpenCV's: x right, y down, (0, 0) at the centre of the top-left pixel.
+Pixel coordinates are OpenCV's: x right, y down, (0, 0) at the center of the top-left pixel.
 Points are in the camera's optical frame: x right, y down, z forward, m.
 
 With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (x', y'), and
@@ -55,7 +55,7 @@ FOCAL_LENGTH_RANGE = (0.02, 1000.0)
 #: twice or half the size is off by 0.5 and 0.25.
 OFF_CENTER = 0.15
 _SIZE = Range(1, 65535, 'px', whole=True)
-#: Beyond this radius in normalised coordinates (84 degrees off axis) nothing is projected.
+#: Beyond this radius in normalized coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
 
 
@@ -73,7 +73,7 @@ class CameraModel:
     """
     The intrinsic calibration of one camera; not to be altered.
 
-    ``radius`` is the radius in normalised coordinates up to which the distortion is one-to-one.
+    ``radius`` is the radius in normalized coordinates up to which the distortion is one-to-one.
 
     :param matrix: K, shape (3, 3), px.
     :param distortion: D; shorter is filled up with zeros if the model allows it (none at all,
@@ -111,7 +111,7 @@ class CameraModel:
         falling = np.flatnonzero(~(np.diff(radii * self._scale(radii**2)[0]) > 0.0))
         self.radius = float(radii[falling[0]]) if falling.size else _RADIUS_LIMIT
         if self.radius == 0.0:
-            raise ValueError(f'D = {self.distortion.tolist()}: folds the image at its centre')
+            raise ValueError(f'D = {self.distortion.tolist()}: folds the image at its center')
 
     @classmethod
     def from_calibration(cls, K: ArrayLike, D: ArrayLike, distortion_model: str,
@@ -169,7 +169,7 @@ class CameraModel:
                 f'binning {binning_x}x{binning_y}, optical axis at {shares[0]:.0%}, '
                 f'{shares[1]:.0%} of the image: K is binned already; camera_info must have K, '
                 'width and height of the full image, or those of the binned one and binning 0')
-        # A binned pixel's centre lies half a binned pixel from its edge: shift, scale, shift.
+        # A binned pixel's center lies half a binned pixel from its edge: shift, scale, shift.
         matrix = self.matrix.copy()
         matrix[:2, 2] += 0.5 - np.array([x_offset, y_offset])
         matrix[:2] /= np.array([[binning_x], [binning_y]])
@@ -198,7 +198,7 @@ class CameraModel:
 
     def distort(self, xy: Array) -> Array:
         """
-        Return the pixels (N, 2) of normalised coordinates (N, 2) = (X/Z, Y/Z).
+        Return the pixels (N, 2) of normalized coordinates (N, 2) = (X/Z, Y/Z).
 
         NaN if the distortion folds back.
         """
@@ -224,7 +224,7 @@ class CameraModel:
         return pixels
 
     def linear_map(self, x: float, y: float) -> Array:
-        """Return d pixel / d (x, y), (2, 2), px, at one place in normalised coordinates."""
+        """Return d pixel / d (x, y), (2, 2), px, at one place in normalized coordinates."""
         mapped: Array = self.matrix[:2, :2].dot(np.array(self._slopes(x, y)).reshape(2, 2))
         return mapped
 
@@ -245,7 +245,7 @@ class CameraModel:
 
     def undistort(self, pixels: ArrayLike) -> Array:
         """
-        Return the normalised coordinates (N, 2) = (X/Z, Y/Z) of pixels (N, 2).
+        Return the normalized coordinates (N, 2) = (X/Z, Y/Z) of pixels (N, 2).
 
         Newton's method on the exact distortion, to 1e-10; NaN if no point projects there.
         """
@@ -300,7 +300,7 @@ class CameraModel:
             g = t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
             slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
             dg = (slope / (1.0 + safe) - g) / (2.0 * safe)
-            # At the centre both are limits: t = r - r^3 / 3.
+            # At the center both are limits: t = r - r^3 / 3.
             near = r2 < 1e-8
             return np.where(near, 1.0, g), np.where(near, k1 - 1.0 / 3.0, dg)
         k1, k2, _, _, k3, *rational = self.distortion.tolist()

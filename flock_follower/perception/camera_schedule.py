@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-Decides which neighbours to look for in which camera's image, and how often to search whole images.
+Decides which neighbors to look for in which camera's image, and how often to search whole images.
 
-With one camera, every neighbour is looked for in every image. With several, a neighbour that
+With one camera, every neighbor is looked for in every image. With several, a neighbor that
 another camera has just seen is looked for only where it is expected inside, and without a search;
 less often if it was not found there.
 Each of n cameras searches whole images n times less often, so that more cameras cost no more.
@@ -39,13 +39,13 @@ from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.perception.search import N_PORTIONS
 from flock_follower.perception.time_offset import MountedCamera
 
-#: Shortest time between two attempts to find a neighbour that another camera sees, s.
+#: Shortest time between two attempts to find a neighbor that another camera sees, s.
 SEARCH_PERIOD = 0.1
-#: A whole image is searched for a missing neighbour in portions, one for so much time, s.
+#: A whole image is searched for a missing neighbor in portions, one for so much time, s.
 PORTION_PERIOD = 1.0 / 30.0
-#: Period of searches although no neighbour is missing, s: for further markers with a known id.
+#: Period of searches although no neighbor is missing, s: for further markers with a known id.
 SWEEP_PERIOD = 1.0
-#: A neighbour that a camera measured at most this time ago, s, is tracked by that camera.
+#: A neighbor that a camera measured at most this time ago, s, is tracked by that camera.
 FRESH = 0.25
 #: Images of two cameras not farther apart than this, s, were taken at once.
 TOGETHER = 1e-4
@@ -56,14 +56,14 @@ NEAREST = 0.05
 
 
 class Sought(NamedTuple):
-    """Names of neighbours: expected in the image, and to be searched for in the whole image."""
+    """Names of neighbors: expected in the image, and to be searched for in the whole image."""
 
     near: list[str]
     anywhere: list[str]
 
 
 class CameraSchedule:
-    """Assigns the neighbours to the cameras that look for them; times are the odometry's, s."""
+    """Assigns the neighbors to the cameras that look for them; times are the odometry's, s."""
 
     def __init__(self, neighbors: Iterable[MarkedNeighbor], cameras: int) -> None:
         self._cameras = cameras
@@ -74,25 +74,25 @@ class CameraSchedule:
         self.restart()
 
     def restart(self) -> None:
-        """Forget which camera saw which neighbour."""
+        """Forget which camera saw which neighbor."""
         self._seen: dict[str, tuple[MountedCamera, float]] = {}
 
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
-        """Take that a camera measured a neighbour."""
+        """Take that a camera measured a neighbor."""
         self._seen[name] = camera, time
 
     def seen_last_by(self, name: str, camera: MountedCamera) -> bool:
-        """Return whether no other camera saw a neighbour since this one did."""
+        """Return whether no other camera saw a neighbor since this one did."""
         return self._seen.get(name, (camera, 0.0))[0] is camera
 
     def time(self, name: str, camera: MountedCamera, time: float) -> float:
-        """Return a time for a neighbour's filter: images taken at once have different ones."""
+        """Return a time for a neighbor's filter: images taken at once have different ones."""
         last, seen = self._seen.get(name, (camera, time))
         return seen + STEP if last is not camera and abs(time - seen) < TOGETHER else time
 
     def sought(self, camera: MountedCamera, time: float, model: CameraModel,
                T_camera_odom: Transform, filters: Mapping[str, NeighborFilter]) -> Sought:
-        """Return the neighbours to look for in an image of one of several cameras."""
+        """Return the neighbors to look for in an image of one of several cameras."""
         sought = Sought([], [])
         for name, track in filters.items():
             last, seen = self._seen.get(name, (camera, -math.inf))
@@ -121,7 +121,7 @@ class CameraSchedule:
         return False
 
     def search_due(self, camera: MountedCamera, stamp: float) -> bool:
-        """Return whether to search the whole image of a stamp, s, for a missing neighbour."""
+        """Return whether to search the whole image of a stamp, s, for a missing neighbor."""
         return self.portions(camera, stamp) > 0
 
     def portions(self, camera: MountedCamera, stamp: float) -> int:
@@ -136,11 +136,6 @@ class CameraSchedule:
     def has_time_for_all(self, camera: MountedCamera) -> bool:
         """Return whether the images come so rarely that one has time for all portions."""
         return camera.interval >= N_PORTIONS * PORTION_PERIOD
-
-    def missed_before(self, name: str, camera: MountedCamera, stamp: float) -> bool:
-        """Return whether a neighbor was missed in the image before that of a stamp, s."""
-        last = stamp + camera.time_offset.applied - camera.interval
-        return camera.vain.get(name, -math.inf) > last - 1e-3
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, although none is missing."""

@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Fits a neighbour's pose to the edges of its markers, from a roughly known pose.
+Fits a neighbor's pose to the edges of its markers, from a roughly known pose.
 
 Brightness profiles are taken across the known edges between black and white. The derivative of a
 profile, smoothed as widely as the image is blurred, peaks at the edge. Unlike the level half-way
 between black and white, the peak hardly moves if blur dims a narrow cell.
 
-The fit minimises the squared distances between edges and model, across the edges: Gauss-Newton
+The fit minimizes the squared distances between edges and model, across the edges: Gauss-Newton
 with Tukey's weights, so that covered or dirty edges do not count. Gamma and over-exposure make
 white areas swell ("bloom"): all edges shift from white to black. The fit estimates this shift with
 the pose, one for edges across the marker's x axis and one for those across y, because motion blurs
@@ -54,16 +54,16 @@ _REACH = 2 * _HALF  # likewise of a profile
 _KERNEL_SIGMA = 2.0  # samples
 #: A point and a step, (1, 2), times this: the places along a profile.
 _STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
-_MIN_SLOPE = 1.0  # grey levels per px: weaker edges are ignored
+_MIN_SLOPE = 1.0  # gray levels per px: weaker edges are ignored
 #: Fainter edges, as a share of the median slope, are ignored. Those in a shadow have 0.2 of it;
 #: those of cells narrower than _NARROW, px, are faint because they run into one another.
 _FAINT, _FAINT_NARROW, _NARROW = 0.15, 0.3, 4.0
 _MIN_SHARE = 0.5  # of the edges must be found
 _WIDE = 0.5  # px between samples, for sharp images of large markers
-_FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbour,
+_FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbor,
 _NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
 _LEAST_VARIANCE = 1e-9  # px^2: to divide by
-#: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbour.
+#: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbor.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
 _ONES, _DIFFERENCE = np.ones(2), np.array([1.0, -1.0])
 
@@ -72,7 +72,7 @@ def _correlation() -> Any:
     """Return the matrix from a profile (17,) to its smoothed derivative in the middle (9,)."""
     k = np.arange(-_HALF, _HALF + 1.0)
     kernel = k * np.exp(-0.5 * (k / _KERNEL_SIGMA)**2)
-    kernel /= kernel @ k  # one grey level per sample gives 1
+    kernel /= kernel @ k  # one gray level per sample gives 1
     matrix = np.zeros((2 * _REACH + 1, 2 * _HALF + 1), dtype=np.float32)
     for i in range(2 * _HALF + 1):
         matrix[i:i + 2 * _HALF + 1, i] = kernel
@@ -137,7 +137,7 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
 
 def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     """
-    Return where edges are without the shifts by their neighbours, and the blur of either axis, px.
+    Return where edges are without the shifts by their neighbors, and the blur of either axis, px.
 
     Blurred by s in all, an edge at 0 and its opposite at d give the smoothed derivative
     C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
@@ -151,9 +151,9 @@ def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
         square = room * room
         for again in (True, True, False):
             blurred = np.maximum(variance, _LEAST_VARIANCE)[model.axis]
-            normalised = square / blurred[:, None]
-            e = np.exp(np.minimum(-0.5 * normalised, -_NEAR))
-            bend = 1.0 + ((normalised - 1.0) * e).dot(_ONES)
+            normalized = square / blurred[:, None]
+            e = np.exp(np.minimum(-0.5 * normalized, -_NEAR))
+            bend = 1.0 + ((normalized - 1.0) * e).dot(_ONES)
             if again:
                 variance = _typical(found.variance * bend / (1.0 - e.dot(_ONES)), known)
         offsets -= (room * e).dot(_DIFFERENCE) / bend

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The edges of a neighbour's markers in an image, as a pose projects them; normal equations.
+The edges of a neighbor's markers in an image, as a pose projects them; normal equations.
 
 ``solve_normal`` and ``normal_covariance`` serve every fit. Both solve normal equations of least
 squares by Cholesky, and only if the equations determine every unknown: Gaussian elimination also
@@ -174,7 +174,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def _scale(along: Array, examples: tuple[int, int], depth: float) -> tuple[float, float]:
-    """Return px per m across edges of either axis, from their unnormalised tangents (n, 2)."""
+    """Return px per m across edges of either axis, from their unnormalized tangents (n, 2)."""
     (ax, ay), (bx, by) = (along[k].tolist() for k in examples)
     area = abs(ax * by - ay * bx) / depth
     return area / max(math.hypot(ax, ay), 1e-9), area / max(math.hypot(bx, by), 1e-9)

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Data association: selects the neighbour's track among all markers with its id.
+Data association: selects the neighbor's track among all markers with its id.
 
-An id may appear twice: on the neighbour, and on a print on a wall. The primary track is used as
-the neighbour. Every other candidate has a track of its own, which replaces the primary track only
-if it can be the neighbour:
+An id may appear twice: on the neighbor, and on a print on a wall. The primary track is used as
+the neighbor. Every other candidate has a track of its own, which replaces the primary track only
+if it can be the neighbor:
 
 ===============================  ================================================================
 the primary track is             the candidate takes its place
@@ -132,7 +132,7 @@ class Taken(NamedTuple):
 
 
 class Hypotheses:
-    """The primary track of one neighbour, and the candidates with the same marker."""
+    """The primary track of one neighbor, and the candidates with the same marker."""
 
     def __init__(self, params: FilterParams) -> None:
         self.params = params

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Converts image messages to grey arrays of shape (height, width), uint8.
+Converts image messages to gray arrays of shape (height, width), uint8.
 
 ``decode`` takes the payload of ``sensor_msgs/Image``; a mono8 payload is returned as a view
 without a copy (read-only if the payload is). ``decode_compressed`` takes that of
@@ -107,7 +107,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 GrayImage = NDArray[np.uint8]
 
 
-#: Encoding (``sensor_msgs/image_encodings``) -> bytes per pixel, OpenCV's conversion to grey.
+#: Encoding (``sensor_msgs/image_encodings``) -> bytes per pixel, OpenCV's conversion to gray.
 #: ROS names a Bayer pattern by its first row and column, OpenCV by its second: RGGB is BayerBG.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     'mono8': (1, None),
@@ -252,7 +252,7 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
     return bytes(data)
 
 
-def grey_levels(image: GrayImage, pixels: Array) -> Any:
+def gray_levels(image: GrayImage, pixels: Array) -> Any:
     """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
     at = pixels.astype(np.float32)[:, None]
     return cv2.remap(image, at, None, cv2.INTER_LINEAR,

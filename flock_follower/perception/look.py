@@ -16,7 +16,7 @@
 One image on its way through perception: the expected and the found content.
 
 ``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
-shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbour
+shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbor
 counts as seen when the row of its markers' middle was exposed. The rows above and below see it
 earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners to
 where they were with the middle row, by the relative motion, which comes mostly from the own rates.
@@ -79,7 +79,7 @@ class View(NamedTuple):
         return turning
 
     def prior(self, estimate: Estimate | None) -> PosePrior:
-        """Return the expected pose of a neighbour, given its estimate or None."""
+        """Return the expected pose of a neighbor, given its estimate or None."""
         pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
         return PosePrior(pose, self.T_smooth_camera.rotation[2])
 
@@ -93,7 +93,7 @@ class View(NamedTuple):
     def passing(self, T_camera_body: Transform, reference: Array,
                 estimate: Estimate | None) -> tuple[Array, Array]:
         """
-        Return how a neighbour moves past the camera: velocity of a point, m/s, and rates, rad/s.
+        Return how a neighbor moves past the camera: velocity of a point, m/s, and rates, rad/s.
 
         :param reference: the point (3,) on the body; :param estimate: its state, if known: else
             it is taken to fly along.
@@ -174,7 +174,7 @@ def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeigh
                  T_camera_body: Transform, reference: Array, velocity: Array,
                  rates: Array) -> Transform:
     """
-    Return the pose of a neighbour at the time of one row, from the pose fitted to all of them.
+    Return the pose of a neighbor at the time of one row, from the pose fitted to all of them.
 
     :param reference: the point (3,) on its body whose row that is, m.
     :param velocity: of that point seen from the camera, m/s, and :param rates: rad/s, at which the
@@ -205,14 +205,14 @@ class Sighting:
     """
     The result of one image.
 
-    ``estimates`` and ``measurements`` by neighbour's name, of the neighbours measured in this
+    ``estimates`` and ``measurements`` by neighbor's name, of the neighbors measured in this
     image; ``poses`` are the measured ones, except those whose attitude was not plausible;
     ``stage`` is the costliest stage of detection that was used, 'none' if the image could
-    not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
-    for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
-    by names made of the neighbours', are the states of candidates measured in this image that
-    carry a neighbour's marker and are not its primary track. ``misprints``: why the marker of a
-    neighbour, by its name, was found and refused.
+    not be used or no neighbor was to be detected in it. ``rejections`` are (reason, detail), one
+    for each thing dropped; ``other_ids`` are the ids of markers of no neighbor. ``duplicates``,
+    by names made of the neighbors', are the states of candidates measured in this image that
+    carry a neighbor's marker and are not its primary track. ``misprints``: why the marker of a
+    neighbor, by its name, was found and refused.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -226,18 +226,18 @@ class Sighting:
 
     @property
     def stages(self) -> dict[str, str]:
-        """Return how each neighbour measured was found: 'track', 'roi' or 'full'."""
+        """Return how each neighbor measured was found: 'track', 'roi' or 'full'."""
         return {name: measured.stage for name, measured in self.measurements.items()}
 
 
 @dataclass
 class Look:
     """
-    An image of a camera: the neighbours expected, those to search for, and those measured.
+    An image of a camera: the neighbors expected, those to search for, and those measured.
 
-    ``near`` are the neighbours that may be in the image where they are expected, ``anywhere``
+    ``near`` are the neighbors that may be in the image where they are expected, ``anywhere``
     those to search for if they are not found there. ``expected`` and ``measured`` are by
-    neighbour; ``others`` are measurements of candidates, not of the primary track.
+    neighbor; ``others`` are measurements of candidates, not of the primary track.
     """
 
     stamp: float
@@ -255,12 +255,12 @@ class Look:
 
     @property
     def missing(self) -> list[str]:
-        """Return the neighbours to search for that are not measured yet."""
+        """Return the neighbors to search for that are not measured yet."""
         return [name for name in self.anywhere if name not in self.measured]
 
     def confirmed(self, image: GrayImage, found: Measurement, sought: Target,
                   dictionary: str) -> Measurement:
-        """Return a measurement of a neighbour, or what its detected marker shows instead."""
+        """Return a measurement of a neighbor, or what its detected marker shows instead."""
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
             recent = self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD
@@ -281,7 +281,7 @@ class Look:
         return found
 
     def distance(self, measurement: Measurement) -> float:
-        """Return how far a body is from where its neighbour is expected, or from the camera, m."""
+        """Return how far a body is from where its neighbor is expected, or from the camera, m."""
         expected = self.expected[measurement.name].pose
         place = np.zeros(3) if expected is None else expected.translation
         return math.dist(measurement.T_camera_body.translation, place)
@@ -300,5 +300,5 @@ class Look:
         return any(math.dist(middle, corners.mean(axis=0)) < size for middle in middles)
 
     def _of(self, name: str) -> list[Measurement]:
-        """Return the measurements of a neighbour and of its candidates."""
+        """Return the measurements of a neighbor and of its candidates."""
         return [each for each in (*self.measured.values(), *self.others) if each.name == name]

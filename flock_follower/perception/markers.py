@@ -17,7 +17,7 @@ The one place that calls ``cv2.aruco``, the same for OpenCV 4.6 and 4.7 to 5.
 
 OpenCV 4.6 (Ubuntu 24.04) has free functions and ``DetectorParameters_create()``, and crashes on
 ``DetectorParameters()``; 4.7 brought ``ArucoDetector`` and 5 dropped the functions.
-Pixel coordinates are OpenCV's: (0, 0) at the centre of the top-left pixel.
+Pixel coordinates are OpenCV's: (0, 0) at the center of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def dictionary_words(dictionary: str) -> NDArray[np.bool_]:
 
 def detect(image: GrayImage, dictionary: str, border: int = 1) -> Detections:
     """
-    Return the markers of one dictionary in a grey image (H, W) uint8, contiguous.
+    Return the markers of one dictionary in a gray image (H, W) uint8, contiguous.
 
     :param border: cells of the black border; prints with one more are found, too.
     :raises ValueError: for an unknown dictionary.
@@ -189,7 +189,7 @@ def marker_corners(side_length: float) -> Array:
 
 def load(path: str | Path) -> NeighborConfig:
     """
-    Read a neighbours file; its dictionary is one of the OpenCV at hand.
+    Read a neighbors file; its dictionary is one of the OpenCV at hand.
 
     :raises ValueError, OSError: see :func:`flock_follower.neighbors_file.load`.
     """

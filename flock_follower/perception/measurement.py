@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The measurement of one neighbour in one image, and the choice between its possible attitudes.
+The measurement of one neighbor in one image, and the choice between its possible attitudes.
 
 A square looks almost the same mirrored about the line of sight, and its edges do not always
-decide. ``choose`` adds two priors: the expected attitude, and that a neighbour flies about
+decide. ``choose`` adds two priors: the expected attitude, and that a neighbor flies about
 upright.
 """
 
@@ -30,7 +30,7 @@ import numpy as np
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
 from flock_follower.perception.edges import moved
 
-#: Errors of an expected attitude, and lean of a neighbour, rad (1 sigma).
+#: Errors of an expected attitude, and lean of a neighbor, rad (1 sigma).
 SIGMA_HISTORY = 0.1
 SIGMA_UPRIGHT = 0.25
 #: History may not outweigh the image for ever: its contribution to chi^2 is capped.
@@ -96,14 +96,14 @@ def angle(a: Transform, b: Transform) -> float:
     return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
 
 
-#: Deviations are widened by this, because neighbouring edges share pixels, and the errors by
+#: Deviations are widened by this, because neighboring edges share pixels, and the errors by
 #: calibration and blur are the same for all.
 WIDENING = 1.5
 
 
 class Measurement(NamedTuple):
     """
-    One neighbour in one image.
+    One neighbor in one image.
 
     ``T_camera_body`` is its body's pose in the optical frame, m. ``covariance`` (6, 6) is of the
     position of ``reference`` (3,), a point on the body, m, then of the rotation vector r in
@@ -111,7 +111,7 @@ class Measurement(NamedTuple):
     from their projections, px; of a smeared marker the difference of its image from the
     rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
     ``spacing``, px, of the brightness profiles, None without profiles: of a smeared print.
-    ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
+    ``margin`` is by how much chi^2 favors this attitude over the mirrored one; 0 if both are
     equal, infinite if several markers decide it, None if it was not checked. ``doubt`` is the
     probability of the mirrored attitude when it was last checked. ``alike`` is the share of the
     covariance that is of errors alike from image to image.

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Estimates a neighbour's position, velocity, attitude and acceleration: a Kalman filter in odom.
+Estimates a neighbor's position, velocity, attitude and acceleration: a Kalman filter in odom.
 
-The state is in odom, not relative to the own vehicle: own manoeuvres do not look like those of the
-neighbour, and slow drift of the odometry moves both alike. ``neighbor_motion`` has the motion
+The state is in odom, not relative to the own vehicle: own maneuvers do not look like those of the
+neighbor, and slow drift of the odometry moves both alike. ``neighbor_motion`` has the motion
 model and the state.
 
 A measurement is the position of a point on the body, where its markers are, and the attitude.
@@ -44,7 +44,7 @@ from flock_follower.perception.innovation import (
     to_body,
     widened,
 )
-from flock_follower.perception.learnt_noise import LEARNING_GAP, LearntMotion
+from flock_follower.perception.learned_noise import LearnedMotion, LEARNING_GAP
 from flock_follower.perception.neighbor_motion import (
     ACCELERATION,
     ATTITUDE,
@@ -83,7 +83,7 @@ LEAST_TURNED, TURNED_FOR = 3, 0.19
 NEAREST = 0.01
 #: Of a state that is moved, the velocity is uncertain by the way divided by this, s.
 SETTLING = 0.2
-_CENTRE = np.zeros(3)
+_CENTER = np.zeros(3)
 _UNSCALED = [1.0] * 6  # attitude and its rate
 
 
@@ -112,7 +112,7 @@ class Change(NamedTuple):
 
 class NeighborFilter:
     """
-    The filter of one neighbour.
+    The filter of one neighbor.
 
     A measurement outside the gate is used with less weight. The first gets the weight that puts it
     on the gate: it may be wrong. If the next one is off to the same side, the track is wrong, and
@@ -128,7 +128,7 @@ class NeighborFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the neighbour."""
+        """Forget the neighbor."""
         self.change: Change | None = None
         """Of the newest measurement; None if it was not used, or if it began the track."""
         self.newest: Estimate | None = None
@@ -138,8 +138,8 @@ class NeighborFilter:
         self._surprises: dict[str, Array] = {}
         self._alike = AlikeErrors()
         self._range_gate = RangeGate(most=self.params.max_rejections)
-        self._line = _CENTRE  # on which the last distance was measured
-        self._motion = LearntMotion()
+        self._line = _CENTER  # on which the last distance was measured
+        self._motion = LearnedMotion()
         self._before: tuple[Array, Array] | None = None  # the last innovation, its covariance
 
     def predict(self, stamp: float) -> Estimate | None:
@@ -182,10 +182,10 @@ class NeighborFilter:
         """
         Add an error state (15,) that was found elsewhere, and widen the covariance accordingly.
 
-        The state is then that of ``later``, s, after its stamp. The motion that was learnt with
+        The state is then that of ``later``, s, after its stamp. The motion that was learned with
         the error is forgotten.
         """
-        self._motion = LearntMotion()
+        self._motion = LearnedMotion()
         if self.newest is not None:
             covariance = self.newest.covariance + np.outer(error, error)
             covariance[VELOCITY, VELOCITY] += error.dot(error) / SETTLING**2 * np.eye(3)
@@ -261,7 +261,7 @@ class NeighborFilter:
             common = remain.dot(shared).dot(gain)
             corrected -= common + common.T
         self._alike.take(remain, gain.T, root)
-        self._predicted, self._line = None, _CENTRE
+        self._predicted, self._line = None, _CENTER
         self.newest = expected.corrected(gain.T.dot(innovation), corrected)
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
@@ -315,7 +315,7 @@ class NeighborFilter:
         return prior, False, jacobian, covariance[:3, :3], innovation
 
     def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
-                     reference: Array = _CENTRE) -> UpdateOutcome:
+                     reference: Array = _CENTER) -> UpdateOutcome:
         """
         Update with the own distance, m, to ``reference`` (3,), a point on the body, m.
 

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-The state of a neighbour and its motion model.
+The state of a neighbor and its motion model.
 
-``Estimate``: position p, velocity v and acceleration a of the neighbour's body, its attitude R
+``Estimate``: position p, velocity v and acceleration a of the neighbor's body, its attitude R
 (body to odom) and angular velocity w, all in odom. The error state is (dp, dv, dr, dw, da), (15,),
 with R_true = exp(dr) R, a rotation vector along odom's axes.
 
@@ -53,7 +53,7 @@ POSE = np.concatenate([np.eye(SIZE)[POSITION], np.eye(SIZE)[ATTITUDE]])
 
 class Estimate(NamedTuple):
     """
-    A neighbour's state at a stamp, s, in odom.
+    A neighbor's state at a stamp, s, in odom.
 
     ``position`` (3,), m; ``velocity`` (3,), m/s; ``rotation`` (3, 3), body to odom;
     ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
@@ -96,7 +96,7 @@ class Estimate(NamedTuple):
 
     @property
     def pose(self) -> Transform:
-        """Return ``T_odom_body`` of the neighbour."""
+        """Return ``T_odom_body`` of the neighbor."""
         return Transform(self.rotation, self.position)
 
     @property
@@ -106,13 +106,13 @@ class Estimate(NamedTuple):
 
     @property
     def child_twist(self) -> Array:
-        """Return linear and angular velocity (6,) in the neighbour's body frame (REP-105)."""
+        """Return linear and angular velocity (6,) in the neighbor's body frame (REP-105)."""
         return np.concatenate([self.rotation.T @ self.velocity,
                                self.rotation.T @ self.angular_velocity])
 
     @property
     def child_acceleration(self) -> Array:
-        """Return the acceleration (3,) in the neighbour's body frame."""
+        """Return the acceleration (3,) in the neighbor's body frame."""
         return self.rotation.T @ self.acceleration
 
     @property
@@ -139,22 +139,22 @@ class Estimate(NamedTuple):
 _EYE = np.eye(3)
 #: Random walk of the own position without a measured velocity, m/sqrt(s).
 ODOMETRY_WALK = 0.02
-#: Standard deviation of a neighbour's angular velocity before any motion was seen, rad/s.
+#: Standard deviation of a neighbor's angular velocity before any motion was seen, rad/s.
 INITIAL_RATE = 0.5
 
 
 @dataclass(frozen=True)
 class FilterParams(Checked):
     """
-    Motion model of neighbours, and limits for measurements.
+    Motion model of neighbors, and limits for measurements.
 
-    ``acceleration`` is the standard deviation of a neighbour's acceleration, m/s^2 per axis, and
+    ``acceleration`` is the standard deviation of a neighbor's acceleration, m/s^2 per axis, and
     ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
     spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
     ``odometry_noise`` is the random walk of the error of the own velocity, m/s^2/sqrt(Hz).
     ``initial_speed``, m/s, is the deviation before any motion has been seen.
     ``attitude_noise``, rad, is the noise of the own attitude from one image to the next; it moves
-    a distant neighbour sideways.
+    a distant neighbor sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, or in 0.2 s at
     least three whose attitude is; as does a gap
     above ``max_gap`` s or a stamp more than ``MAX_JUMP`` s back. A restart that needs more than
@@ -163,9 +163,9 @@ class FilterParams(Checked):
 
     acceleration: float = parameter(
         0.5, Range(0.01, 100.0, 'm/s^2'),
-        "standard deviation of a neighbour's acceleration per axis", live=False)
+        "standard deviation of a neighbor's acceleration per axis", live=False)
     acceleration_time: float = parameter(
-        1.0, Range(0.01, 100.0, 's'), "correlation time of a neighbour's acceleration", live=False)
+        1.0, Range(0.01, 100.0, 's'), "correlation time of a neighbor's acceleration", live=False)
     angular_noise: float = parameter(2.0, Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'))
     odometry_noise: float = parameter(0.03, Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True))
     initial_speed: float = parameter(1.0, Range(0.0, 100.0, 'm/s', above=True))
@@ -174,7 +174,7 @@ class FilterParams(Checked):
     max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
     leader_speed_max: float = parameter(
         2.0, Range(0.0, FASTEST, 'm/s'),
-        "a track restarts only at a place that a neighbour at this speed can reach; the planner's "
+        "a track restarts only at a place that a neighbor at this speed can reach; the planner's "
         'leader_speed_max must be the same',
         live=False)
 
@@ -227,7 +227,7 @@ def turned_along(covariance: Array, before: Array, now: Array) -> Array:
     """
     Return a covariance (15, 15) turned from one line to another.
 
-    If only its distance is known, a neighbour may be anywhere on a sphere. If the line to its
+    If only its distance is known, a neighbor may be anywhere on a sphere. If the line to its
     likeliest place turns, from ``before`` to ``now``, unit vectors (3,), the covariance turns with
     that line. ``before`` of zeros turns nothing.
     """

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The debug image: an image with the measured neighbours drawn in."""
+"""The debug image: an image with the measured neighbors drawn in."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
     """
     Return a copy of an image (H, W) uint8 as BGR (H, W, 3), with its sighting drawn over it.
 
-    Of each measured neighbour: the outlines of its markers that face the camera, in the colour of
+    Of each measured neighbor: the outlines of its markers that face the camera, in the color of
     the stage of detection, the axes of its body, x red, y green, z blue, and the ellipse of two
     standard deviations of the place that was measured, in white. The text on top lists
-    distances, neighbours that are not seen, and rejections.
+    distances, neighbors that are not seen, and rejections.
     """
     canvas: ColorImage = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
     lines = []

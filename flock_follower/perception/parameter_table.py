@@ -38,7 +38,7 @@ HAND_ANGULAR_NOISE = 8.0  # rad/s^2/sqrt(Hz)
 
 RELATIVE_POSE = [
     Spec('neighbors_file', '',
-         'YAML file of the neighbours and their markers; empty: config/neighbors.yaml of this '
+         'YAML file of the neighbors and their markers; empty: config/neighbors.yaml of this '
          'package'),
     Spec('camera_position', list(DEFAULT_POSITION),
          'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
@@ -77,7 +77,7 @@ def tracker(values: Mapping[str, Any]) -> Tracker:
     """
     Return the tracker of the parameters of relative_pose.
 
-    :raises ValueError: if they, or the neighbours' file, are wrong.
+    :raises ValueError: if they, or the neighbors' file, are wrong.
     :raises OSError: if the file cannot be read.
     """
     path = values['neighbors_file'] or resource('config/neighbors.yaml')

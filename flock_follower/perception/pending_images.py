@@ -74,7 +74,7 @@ class Processed(NamedTuple):
     """
     The result of one image.
 
-    ``pixels`` is None if the image was not decoded: it cannot be used, or no neighbour is to be
+    ``pixels`` is None if the image was not decoded: it cannot be used, or no neighbor is to be
     looked for in it. ``decoding`` and ``perception`` are the times spent, s.
     """
 
@@ -86,7 +86,7 @@ class Processed(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Return whether calibration, odometry and image were there to look for neighbours."""
+        """Return whether calibration, odometry and image were there to look for neighbors."""
         return not any(reason in _UNUSABLE for reason, _ in self.sighting.rejections)
 
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-From a neighbour's markers in an image to its pose and covariance.
+From a neighbor's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
 and the more probable is kept. If motion or a lens out of focus leave no edges, the whole print is
@@ -57,7 +57,7 @@ from flock_follower.perception.square_pose import ippe, mirror
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
-#: If cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
+#: If cells are narrow, in the distance or aslant, neighboring edges blur into one another. On
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
@@ -83,7 +83,7 @@ SMEAR_DEGREES = 40.0
 
 
 class Target(NamedTuple):
-    """A neighbour and the image models of its markers, in their order."""
+    """A neighbor and the image models of its markers, in their order."""
 
     neighbor: MarkedNeighbor
     model: EdgeModel
@@ -91,7 +91,7 @@ class Target(NamedTuple):
 
 
 def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
-    """Return the image model of a neighbour with markers of a dictionary."""
+    """Return the image model of a neighbor with markers of a dictionary."""
     return Target(neighbor, edge_model(neighbor, dictionary),
                   tuple(smear_model(marker, dictionary) for marker in neighbor.markers))
 
@@ -99,7 +99,7 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           last: Measurement | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return a neighbour close to where it is expected, or None if its markers are not there.
+    Return a neighbor close to where it is expected, or None if its markers are not there.
 
     :param last: its last measurement, if any: if its print was smeared, edges are looked for only
         if it is so no longer.
@@ -133,7 +133,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
 
 
 class _Whole(NamedTuple):
-    """A fit to the whole print of a marker, by its number among the neighbour's."""
+    """A fit to the whole print of a marker, by its number among the neighbor's."""
 
     number: int
     fit: SmearFit
@@ -179,9 +179,9 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
            expected: PosePrior, smeared: bool = True) -> Measurement | None:
     """
-    Return a neighbour one of whose markers was detected, or None if no pose suits it.
+    Return a neighbor one of whose markers was detected, or None if no pose suits it.
 
-    :param index: of the marker among the neighbour's.
+    :param index: of the marker among the neighbor's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
     :param smeared: whether its whole print is fitted if its edges are smeared.
     """
@@ -206,7 +206,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
                    starts: list[Transform], expected: PosePrior) -> Measurement | None:
-    """Return a neighbour by the whole print of a detected marker, smeared."""
+    """Return a neighbor by the whole print of a detected marker, smeared."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
     if len(fits) == 1:
@@ -287,7 +287,7 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Wh
 
 
 def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | None:
-    """Return the pose of a neighbour mirrored about the sight of a marker; None if the same."""
+    """Return the pose of a neighbor mirrored about the sight of a marker; None if the same."""
     on_body = sought.neighbor.markers[index].T_body_marker
     return mirror(pose, pose.apply(on_body.translation[None])[0], on_body.rotation[:, 2])
 

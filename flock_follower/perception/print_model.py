@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
 from flock_follower.neighbors_file import MarkedNeighbor, Marker
-from flock_follower.perception.images import GrayImage, grey_levels
+from flock_follower.perception.images import gray_levels, GrayImage
 from flock_follower.perception.markers import (
     correctable_cells,
     dictionary_words,
@@ -45,11 +45,11 @@ from flock_follower.perception.markers import (
 
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
 SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
-_MIN_APART = 4.0  # grey levels between black and white, both in the shade
+_MIN_APART = 4.0  # gray levels between black and white, both in the shade
 #: Black or white cells are not used if their variance exceeds this share of the squared half of
 #: their contrast.
 _MAX_SPREAD = 0.35
-_SATURATED = 250.0  # grey levels
+_SATURATED = 250.0  # gray levels
 
 
 class Windows(NamedTuple):
@@ -57,7 +57,7 @@ class Windows(NamedTuple):
     Windows on the c cells of a marker.
 
     ``cells`` (w, k) are the indices of the cells in each window, repeated where it has fewer
-    than k; ``white`` and ``black`` (w, k) are 1 if a cell should have that colour, else 0, and
+    than k; ``white`` and ``black`` (w, k) are 1 if a cell should have that color, else 0, and
     0 for those repeated. ``places`` (c, p) are where in (w, k), flattened, each cell is, repeated
     where it is in fewer than p.
     """
@@ -78,7 +78,7 @@ def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
             for top in range(int(row.max()) - height + 2):
                 inside = np.flatnonzero((column >= left) & (column < left + width)
                                         & (row >= top) & (row < top + height))
-                # Whichever is judged by the others, both colours must be left.
+                # Whichever is judged by the others, both colors must be left.
                 if 2 <= np.count_nonzero(white[inside]) <= len(inside) - 2:
                     chosen.append(inside)
     cells = np.array([np.resize(inside, size) for inside in chosen])
@@ -92,17 +92,17 @@ def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
 
 def read(brightness: Array, seen: Windows) -> Array:
     """
-    Return the colours (n, c) of cells from their brightness (n, c), grey levels, n times alike.
+    Return the colors (n, c) of cells from their brightness (n, c), gray levels, n times alike.
 
     -1: like the black cells around it, 1: like the white ones, 0: no cells to compare with.
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []
     # A cell is not compared with itself, and with no saturated cell that should be black.
-    for colour in (seen.white, seen.black * (values < _SATURATED)):
-        some = values * colour
+    for color in (seen.white, seen.black * (values < _SATURATED)):
+        some = values * color
         sums.append([total.sum(axis=-1, keepdims=True) - total
-                     for total in (colour, some, some * values)])
+                     for total in (color, some, some * values)])
     (whites, white, white2), (blacks, black, black2) = sums
     light, dark = white / whites, black / np.maximum(blacks, 1.0)
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
@@ -115,11 +115,11 @@ def read(brightness: Array, seen: Windows) -> Array:
         np.where(readable, odd, np.inf), np.where(readable, shown, 0.0)))
     best = odd[:, seen.places].argmin(axis=2)
     chosen = seen.places[np.arange(seen.places.shape[0]), best]
-    colours: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
-    return colours
+    colors: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
+    return colors
 
 
-_MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
+_MIN_CONTRAST = 10.0  # gray levels between the black border and the quiet zone
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Further places at which a cell is read, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
@@ -130,10 +130,10 @@ _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where l
 
 class CellCode:
     """
-    The code of a marker of a dictionary: the colours of its cells.
+    The code of a marker of a dictionary: the colors of its cells.
 
     ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
-    then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
+    then of the white ones around, on the neighbor's body, m; ``grid`` (c, 2) their columns and
     rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread. ``others``
     (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells that are
     compared with one another under uneven light. ``beside`` (b, c): 1 for the cells next to an
@@ -180,7 +180,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = 
     other, half as many may be wrong: a mirrored print differs in few cells. If one threshold for
     all cells does not show that, a shadow may lie across: then each is compared with those around.
     """
-    brightness = grey_levels(image, pixels)
+    brightness = gray_levels(image, pixels)
     inner = code.bits.size
     border = brightness[inner:inner + code.border]
     dark, light = median(border), median(brightness[inner + code.border:])
@@ -196,7 +196,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = 
         return True
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
     beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
-    return _shows_in_uneven_light(grey_levels(image, beside).reshape(len(_BESIDE), -1), code,
+    return _shows_in_uneven_light(gray_levels(image, beside).reshape(len(_BESIDE), -1), code,
                                   tracked)
 
 
@@ -217,7 +217,7 @@ def _wrong(agreeing: Array) -> float:
 
 def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> bool:
     """Return whether cells of brightness (n, c), n places in each, are those of a marker."""
-    colours = read(brightness, code.windows).mean(axis=0)
+    colors = read(brightness, code.windows).mean(axis=0)
     saturated: Any = (brightness >= _SATURATED).any(axis=0)
     end = code.bits.size + code.border
     inner, border, around = slice(code.bits.size), slice(code.bits.size, end), slice(end, None)
@@ -225,19 +225,19 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> 
     # saturated as well, unless the marker was there before.
     hidden = saturated[inner] & (code.bits < 0.0)
     if tracked:
-        hidden |= (code.bits < 0.0) & (colours[inner] > 0.0) & (code.beside.dot(saturated) > 0.0)
+        hidden |= (code.bits < 0.0) & (colors[inner] > 0.0) & (code.beside.dot(saturated) > 0.0)
     else:
         hidden &= saturated[around].mean() <= _MOST_HIDDEN
     count, most = np.count_nonzero(hidden), _MOST_HIDDEN_TRACKED if tracked else _MOST_HIDDEN
-    bits = np.where(hidden, 0.0, colours[inner])
+    bits = np.where(hidden, 0.0, colors[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
     wrong = _wrong((bits * code.bits)[~hidden])
     # Codewords differ by more than twice the errors: hidden cells leave a difference.
     return (wrong < (0.5 if count and not tracked else max(0.5 * code.errors, 1.0))
             and count <= most * len(hidden) and (tracked or count <= 2 * code.errors)
             and _is_word(bits, code)
-            and np.count_nonzero(colours[border] < 0.0) >= _MIN_BORDER * code.border
-            and np.count_nonzero(colours[around] > 0.0) >= _MIN_AROUND * len(colours[around]))
+            and np.count_nonzero(colors[border] < 0.0) >= _MIN_BORDER * code.border
+            and np.count_nonzero(colors[around] > 0.0) >= _MIN_AROUND * len(colors[around]))
 
 
 def _is_word(read: Array, code: CellCode) -> bool:
@@ -261,7 +261,7 @@ DERIVATIVES = 9
 
 class EdgeModel:
     """
-    The n edge points of all m markers of a neighbour, on its body (FLU), m.
+    The n edge points of all m markers of a neighbor, on its body (FLU), m.
 
     ``places`` (n + c, 3) are the points, then the middles of the markers' cells. ``tangents``
     (n, 3), unit, have black on the left and white on the right as one faces the marker.
@@ -315,7 +315,7 @@ class EdgeModel:
 
 @lru_cache(maxsize=64)
 def edge_model(neighbor: MarkedNeighbor, dictionary: str) -> EdgeModel:
-    """Return the edges and cells of a neighbour's markers, all of one dictionary."""
+    """Return the edges and cells of a neighbor's markers, all of one dictionary."""
     points, tangents, axis, room, index = [], [], [], [], []
     for k, marker in enumerate(neighbor.markers):
         code = marker_code(dictionary, marker.marker_id)
@@ -373,7 +373,7 @@ def _along(start: float, end: float, border: bool) -> Array:
 
 
 def _room(line: Any, column: int, rising: bool) -> tuple[float, float]:
-    """Return how many cells are of one colour on the black side of an edge, and on the white."""
+    """Return how many cells are of one color on the black side of an edge, and on the white."""
     edges = [-1, *np.flatnonzero(np.diff(line)).tolist(), len(line) - 1]
     k = edges.index(column)
     left, right = float(column - edges[k - 1]), float(edges[k + 1] - column)

@@ -32,7 +32,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, rpy_from_matrix, Transform
 from flock_follower.neighbors_file import Marker
-from flock_follower.perception.images import GrayImage, grey_levels
+from flock_follower.perception.images import gray_levels, GrayImage
 from flock_follower.perception.markers import Detections, joined, marker_code
 from flock_follower.perception.search import everywhere
 
@@ -51,7 +51,7 @@ _OURS = 0.95
 _MAX_LEFT = 0.8
 #: Wide borders are searched for in two of so many searches of whole images.
 _ROUNDS = 8
-#: A neighbour that leans by more, rad, carries a turned print, or is about to crash.
+#: A neighbor that leans by more, rad, carries a turned print, or is about to crash.
 MAX_LEAN = math.radians(60.0)
 WRONG_BORDER, TURNED = 'print with another border', 'print turned'
 #: Reasons why a marker is refused although it was found.
@@ -87,7 +87,7 @@ def border_cells(image: GrayImage, corners: Array, dictionary: str, marker_id: i
     to_image = cv2.getPerspectiveTransform(_SQUARE, corners.astype(np.float32))
 
     def likeness_of(part: slice) -> float:
-        seen = grey_levels(image, cv2.perspectiveTransform(places[None, part], to_image)[0])
+        seen = gray_levels(image, cv2.perspectiveTransform(places[None, part], to_image)[0])
         return float(np.corrcoef(seen, white[part])[0, 1]) if seen.std() > 0.0 else 0.0
 
     parts = [slice(*ends) for ends in pairwise([0, *begins, len(white)])]

@@ -34,7 +34,7 @@ RANGE_GATE = 6.63
 RANGE_WILD = 10.0
 #: Number of distances over which the refused share is reported.
 COUNTED = 200
-#: Before anything was learnt, m: a standard deviation.
+#: Before anything was learned, m: a standard deviation.
 UNKNOWN_BIAS = 0.5
 #: Random walk of the bias, m/sqrt(s).
 WALK = 0.01
@@ -93,7 +93,7 @@ class RangeBias:
 
     def learn(self, stamp: float, excess: float, noise: float) -> None:
         """
-        Learn from a distance measured at a stamp, s, of a neighbour in sight.
+        Learn from a distance measured at a stamp, s, of a neighbor in sight.
 
         :param excess: measured distance less that to the marker, m.
         :param noise: variance of their difference but for the bias, m^2.
@@ -104,6 +104,6 @@ class RangeBias:
             return
         prior *= factors[0]
         gain = prior / (factors[1] * (prior + noise))
-        # A larger assumed noise means a smaller gain: the bias is learnt more slowly.
+        # A larger assumed noise means a smaller gain: the bias is learned more slowly.
         self.value += gain * innovation
         self._variance, self._stamp = (1.0 - gain) * prior, stamp

@@ -13,15 +13,15 @@
 # limitations under the License.
 
 """
-Tracks a neighbour that is out of sight by distances that a radio measures.
+Tracks a neighbor that is out of sight by distances that a radio measures.
 
-One sensor measures the distances to a neighbour: all of them have one bias, one place of the own
+One sensor measures the distances to a neighbor: all of them have one bias, one place of the own
 antenna, and stamps that only grow. A second sensor would need a series of its own.
 
 In sight, a marker measures the distance a hundred times better; then only the error of the ranges
-is learnt. Out of sight, a second filter continues from the state of the first. The second filter
+is learned. Out of sight, a second filter continues from the state of the first. The second filter
 is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
-line of sight. Across it, the uncertainty grows with the neighbour's possible motion; once it
+line of sight. Across it, the uncertainty grows with the neighbor's possible motion; once it
 exceeds the distance, the direction is unknown.
 """
 
@@ -45,19 +45,19 @@ from flock_follower.perception.neighbor_motion import Estimate, POSITION
 from flock_follower.perception.range_gate import RangeBias
 from flock_follower.ranges import Checked, parameter, Range
 
-#: If a neighbour is unseen for this long, s, its state is estimated from its ranges ...
+#: If a neighbor is unseen for this long, s, its state is estimated from its ranges ...
 UNSEEN = 0.5
 #: ... and for so long at most.
 LONGEST = 60.0
-#: A range is used to estimate the bias if the neighbour is seen within this time after it, s.
-LEARNT = 0.1
+#: A range is used to estimate the bias if the neighbor is seen within this time after it, s.
+LEARNED = 0.1
 #: A range stamped up to this far ahead of the newest odometry, s, waits for it; beyond, clocks
 #: differ.
 AHEAD_OF_ODOMETRY = 0.3
 #: A range older than the newest odometry by more, s, is of no use.
 OLDEST_RANGE = 0.5
 MOST_WAITING = 100  # ranges: 2 s at 50 Hz, and a bound on memory
-UNKNOWN = 'range of an unknown neighbour'
+UNKNOWN = 'range of an unknown neighbor'
 INVALID = 'range outside its limits'
 UNTIMELY = 'range stamp repeated, too old or ahead of the odometry'
 UNPLACED = 'range without odometry'
@@ -77,7 +77,7 @@ class RangingParams(Checked):
 
 
 class Ranged(NamedTuple):
-    """A neighbour's state as estimated from its ranges, at the stamp of the newest, ns."""
+    """A neighbor's state as estimated from its ranges, at the stamp of the newest, ns."""
 
     name: str
     stamp: int
@@ -95,9 +95,9 @@ class PlacedRange(NamedTuple):
 
 class Ranging:
     """
-    Takes the ranges of all neighbours, and estimates the states of those out of sight.
+    Takes the ranges of all neighbors, and estimates the states of those out of sight.
 
-    :param filters: of the neighbours seen, by name: never altered here.
+    :param filters: of the neighbors seen, by name: never altered here.
     :param odometry: the own one.
     """
 
@@ -118,7 +118,7 @@ class Ranging:
 
     @property
     def biases(self) -> dict[str, RangeBias]:
-        """Return the biases of the ranges to each neighbour that has sent ranges."""
+        """Return the biases of the ranges to each neighbor that has sent ranges."""
         return {name: series.bias for name, series in self._series.items()
                 if series.newest > -math.inf}
 
@@ -167,7 +167,7 @@ class Ranging:
 
 
 class RangeSeries:
-    """The ranges to an antenna at ``tag`` (3,), m, on a neighbour tracked by camera."""
+    """The ranges to an antenna at ``tag`` (3,), m, on a neighbor tracked by camera."""
 
     def __init__(self, seen: NeighborFilter, tag: Array) -> None:
         self._seen, self._tag = seen, tag
@@ -208,7 +208,7 @@ class RangeSeries:
 
     def _learn(self, measured: PlacedRange, seen: Estimate) -> None:
         then = self._seen.near(measured.stamp)
-        if then is None or seen.stamp - measured.stamp > LEARNT:
+        if then is None or seen.stamp - measured.stamp > LEARNED:
             return
         distance, along = _measured(
             then.position + then.rotation.dot(self._tag) - measured.antenna)

@@ -19,7 +19,7 @@ A quick search is OpenCV's detector, which needs an unbroken outline and reads a
 threshold. A thorough search finds given markers although a shadow's edge lies across them or a
 reflex hides a part. It works on the logarithm of the image: a shadow then darkens black and white
 by the same amount, whatever its depth. The outline is the convex hull of a dark part; a side that
-a reflex has bitten into it is replaced by prolonging its neighbours.
+a reflex has bitten into it is replaced by prolonging its neighbors.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from flock_follower.perception.print_model import cell_code, shows_code
 SIDE = 56.0
 #: From this width on, px, a whole image is searched at half its size.
 LARGE_WIDTH = 1280
-_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels; below about 12 they are noise
+_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of gray levels; below about 12 they are noise
 _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astype(np.uint8)
 #: Side of the window for the mean, px, and of the brush that removes narrower areas. A narrow
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
@@ -78,9 +78,9 @@ _MOST_READ = 6
 def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: MarkedNeighbor,
          expected: Transform, thorough: bool) -> Detections:
     """
-    Return the markers about where a neighbour is expected (``T_camera_body``).
+    Return the markers about where a neighbor is expected (``T_camera_body``).
 
-    :param thorough: whether to search thoroughly, for the neighbour's own markers.
+    :param thorough: whether to search thoroughly, for the neighbor's own markers.
     """
     outlines = [camera.project((expected @ marker.T_body_marker).apply(
         marker_corners(marker.side_length))) for marker in neighbor.markers]
@@ -145,7 +145,7 @@ def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, d
     part = np.ascontiguousarray(part)
     found = (detect(part, dictionary, border) if markers is None
              else _read(part, dictionary, markers, windows))
-    # Pixel centres are whole numbers: half a pixel off before scaling, and after.
+    # Pixel centers are whole numbers: half a pixel off before scaling, and after.
     scales = np.array([part.shape[1] / (x1 - x0), part.shape[0] / (y1 - y0)])
     corners: Array = (found.corners + 0.5) / scales - 0.5 + np.array([x0, y0])
     return Detections(found.ids, corners)
@@ -212,9 +212,9 @@ def _from_square(outlines: Array) -> Array:
 def _local(brightness: Array) -> Array:
     """Return how much squares of cells (n, c) differ from the cells around each, of norm 1."""
     differs = brightness.astype(float).dot(_differences(math.isqrt(brightness.shape[1])))
-    normalised: Array = differs / np.maximum(
+    normalized: Array = differs / np.maximum(
         np.linalg.norm(differs, axis=1, keepdims=True), 1e-6)
-    return normalised
+    return normalized
 
 
 @lru_cache(maxsize=16)

@@ -66,7 +66,7 @@ _MIN_LIKENESS = 0.7
 _DEFOCUS_PENALTY = 0.02
 #: Least correlation of image and print at the end.
 _MIN_FIT_LIKENESS = 0.95
-#: Least difference of white and black, grey levels.
+#: Least difference of white and black, gray levels.
 _MIN_CONTRAST = 10.0
 #: Most steps of a descent.
 _MAX_PASSES = 10
@@ -86,7 +86,7 @@ _MIN_DEPTH = 0.05
 _MIN_INSIDE = 0.8
 #: Error of the blur of lens and print, cells (1 sigma).
 _BLUR_ERROR = 0.05
-#: Least variance of a sample, squared grey levels.
+#: Least variance of a sample, squared gray levels.
 _MIN_VARIANCE = 1.0
 #: Samples whose errors count as one: within a cell they err alike.
 _ALIKE_SAMPLES = 1.5
@@ -194,7 +194,7 @@ def _likeness(brightness: Array, model: SmearModel) -> Array:
 
 class _Seen(NamedTuple):
     """
-    The brightness of samples in an image, (s,), grey levels.
+    The brightness of samples in an image, (s,), gray levels.
 
     ``inside`` (s,), bool: which are in the image; None if all are.
     """
@@ -237,10 +237,10 @@ class _Linear(NamedTuple):
     """
     The print at a pose and a smear, and by how much its samples, (s,), change with each unknown.
 
-    ``design`` (14, s), grey levels per unit of the pose (6), the response (6) and the smear (2);
-    ``steep`` (s,), grey levels squared, of how well blur is known. ``usable`` (s,), bool: samples
+    ``design`` (14, s), gray levels per unit of the pose (6), the response (6) and the smear (2);
+    ``steep`` (s,), gray levels squared, of how well blur is known. ``usable`` (s,), bool: samples
     in the image that show the marker; ``center`` (3,), m, is about which it turns. ``light``:
-    difference between white and black, grey levels.
+    difference between white and black, gray levels.
     """
 
     brightness: Array
@@ -253,7 +253,7 @@ class _Linear(NamedTuple):
 
 class _Descent(NamedTuple):
     """
-    Residuals, (s,), grey levels, after a step, and the inputs of the step.
+    Residuals, (s,), gray levels, after a step, and the inputs of the step.
 
     ``light``: difference between white and black; ``response`` (6, s) to whiteness.
     """
@@ -296,7 +296,8 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
             return None
         pose = moved(pose, at.center, step)
         residual = at.brightness - step.dot(at.design)
-        if count >= _DAMPED_PASSES and turn < _LAST_TURN and max(offset / model.cell, smeared) < _LAST_SHIFT:
+        if count >= _DAMPED_PASSES and turn < _LAST_TURN and (
+                max(offset / model.cell, smeared) < _LAST_SHIFT):
             break
         squares = residual * residual
         variance = max(1.4826**2 * median(squares), _MIN_VARIANCE)
@@ -324,7 +325,7 @@ def _linearize(image: GrayImage, camera: CameraModel, model: SmearModel, start: 
     """
     Return the print near ``start``; None if the image does not show it.
 
-    :param response: difference between white and black, black, and bend, grey levels; None: they
+    :param response: difference between white and black, black, and bend, gray levels; None: they
         are fitted to the image.
     """
     pose, smear, lens = start

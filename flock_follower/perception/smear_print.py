@@ -79,9 +79,9 @@ class SmearModel:
     ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
     for each of :data:`LENS_BLURS`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
-    ``smeared`` (t, s) the samples under them, of mean 0 and norm 1. ``bits`` (b,), 0..1: the inner cells. ``flips``
-    (w, b) is 1 for each cell in which another codeword, in any rotation, differs from them; up to
-    ``errors`` cells may be misread: half of those that can be corrected.
+    ``smeared`` (t, s) the samples under them, of mean 0 and norm 1. ``bits`` (b,), 0..1: the
+    inner cells. ``flips`` (w, b) is 1 for each cell in which another codeword, in any rotation,
+    differs from them; up to ``errors`` cells may be misread: half of those that can be corrected.
     ``cells``: number of cells along a side, with the black border.
     """
 

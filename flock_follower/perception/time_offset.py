@@ -16,17 +16,17 @@
 Estimates the offset between the camera's stamps and the odometry's clock.
 
 An image of stamp t was exposed at t + offset on the odometry's clock. The measured points of a
-neighbour, taken to odom with the own poses at t + offset, are a smooth path only with the true
+neighbor, taken to odom with the own poses at t + offset, are a smooth path only with the true
 offset: otherwise the rotation of the own vehicle moves them.
 
-Every ``BATCH`` seconds, the points of each neighbour are taken to odom with each offset of a grid.
+Every ``BATCH`` seconds, the points of each neighbor are taken to odom with each offset of a grid.
 The misfit of an offset is the chi^2 of a path that begins with any position, velocity and
 acceleration and is driven by white jerk. No offset of the grid is preferred, and nothing is
-linearised: offsets of any size inside the grid are found alike, whatever is applied meanwhile.
+linearized: offsets of any size inside the grid are found alike, whatever is applied meanwhile.
 The misfits of all batches are added, old ones forgotten. The deviation comes from their curvature
-and from the least of them, so unmodelled motion and noise make it larger.
+and from the least of them, so unmodeled motion and noise make it larger.
 
-``MountedCamera`` holds what belongs to one camera on the body: mounting, clock, learnt noise, and
+``MountedCamera`` holds what belongs to one camera on the body: mounting, clock, learned noise, and
 its last searches.
 """
 
@@ -40,7 +40,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometryBuffer
-from flock_follower.perception.learnt_noise import LearntNoise
+from flock_follower.perception.learned_noise import LearnedNoise
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.ranges import MAX_OFFSET
@@ -100,10 +100,10 @@ class TimeOffset:
     def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
              odometry: OdometryBuffer) -> float:
         """
-        Take where a camera saw a neighbour; return by how much the applied offset changed, s.
+        Take where a camera saw a neighbor; return by how much the applied offset changed, s.
 
         :param time: of the exposure by the camera's clock, s.
-        :param camera_point: a point of the neighbour, (3,), m, in the optical frame.
+        :param camera_point: a point of the neighbor, (3,), m, in the optical frame.
         """
         if self.fixed or time < self._resting:
             return 0.0
@@ -177,7 +177,7 @@ class MountedCamera:
 
     :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
-    :param attitude_noise: of the own attitude as its images show it, before it is learnt, rad.
+    :param attitude_noise: of the own attitude as its images show it, before it is learned, rad.
     :param rectified: whether its images are undistorted already.
     """
 
@@ -188,18 +188,18 @@ class MountedCamera:
         self.T_body_camera = T_body_camera
         self.time_offset = time_offset or TimeOffset()
         self.readout_time = readout_time
-        self.noise = LearntNoise(attitude_noise)
+        self.noise = LearnedNoise(attitude_noise)
         self.rectified = rectified
         self.restart(())
 
     def restart(self, names: Iterable[str]) -> None:
-        """Reset all estimates and searches, for neighbours of these names."""
+        """Reset all estimates and searches, for neighbors of these names."""
         self.noise.restart()
         self.time_offset.restart()
         self.searched = self.swept = -math.inf
-        """Stamps of the last whole images searched, s: for a missing neighbour; although none."""
+        """Stamps of the last whole images searched, s: for a missing neighbor; although none."""
         self.vain: dict[str, float] = {}
-        """When a neighbour was last looked for without success, by the odometry's clock, s."""
+        """When a neighbor was last looked for without success, by the odometry's clock, s."""
         self.newest = -math.inf
         """Stamp of the newest image, s."""
         self.interval = math.inf
@@ -209,7 +209,7 @@ class MountedCamera:
         self.portion = 0
         """Number of portions of whole images that were searched."""
         self.unchecked = dict.fromkeys(names, 0)
-        """Number of images for which a neighbour's mirrored attitude need not be checked."""
+        """Number of images for which a neighbor's mirrored attitude need not be checked."""
         self.confirmed_at: dict[str, float] = {}
         """Stamp of the last image in which a neighbor was measured by more than its smear, s."""
         self.measured: dict[str, Measurement] = {}

@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Perception: from images and own odometry to the neighbours' states.
+Perception: from images and own odometry to the neighbors' states.
 
 Detection in each image has up to three stages, the cheapest first:
 
 =======  ==========================================================================
-track    edges are fitted where the filter expects each neighbour's markers
-roi      a neighbour not found that way is detected near its expected place
+track    edges are fitted where the filter expects each neighbor's markers
+roi      a neighbor not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, a portion in each image
 =======  ==========================================================================
 
@@ -77,10 +77,8 @@ from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 MARGIN = 100.0
 #: Images from one fit of the mirrored attitude to the next, otherwise.
 MIRRORED_EVERY = 30
-#: Images from one fit of the mirrored attitude of a smeared print to the next, if it is settled.
+#: Images from one fit of the mirrored attitude of a smeared print to the next.
 SMEARED_EVERY = 3
-#: The same if it is not settled: an image has no time for both in turn.
-UNSETTLED_EVERY = 2
 #: Probability of the mirrored attitude below which the other one is settled.
 SETTLED = 0.05
 #: Of a pose that another detector measured: it comes without an image.
@@ -116,7 +114,7 @@ class _Placed(NamedTuple):
 
 class Tracker:
     """
-    The neighbours of one drone, seen by one camera or several.
+    The neighbors of one drone, seen by one camera or several.
 
     The tracker needs every odometry message, and each image once :meth:`missing` returns None for
     its stamp. A single camera has the name ''. All times of filters are by the odometry's clock.
@@ -202,7 +200,7 @@ class Tracker:
         """
         Return whether to process the image of a stamp, s: else it need not even be decoded.
 
-        With one camera always; with several cameras, only if a neighbour may be in the image.
+        With one camera always; with several cameras, only if a neighbor may be in the image.
         """
         source = self.cameras[camera]
         source.take_stamp(stamp)
@@ -215,9 +213,9 @@ class Tracker:
     def process_image(self, stamp: float, image: GrayImage, model: CameraModel,
                       camera: str = '') -> Sighting:
         """
-        Return the estimates of the neighbours from an image (H, W) uint8 of a stamp, s.
+        Return the estimates of the neighbors from an image (H, W) uint8 of a stamp, s.
 
-        :raises ValueError: if the image is not of the camera's size, or not grey.
+        :raises ValueError: if the image is not of the camera's size, or not gray.
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
@@ -275,7 +273,7 @@ class Tracker:
         return look.sighting
 
     def _sought(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Sought | Missing:
-        """Return the neighbours to look for in an image, or why that is not known."""
+        """Return the neighbors to look for in an image, or why that is not known."""
         if len(self.cameras) == 1:
             return Sought([*self._marked], [*self._marked])
         time = stamp + camera.time_offset.applied
@@ -314,12 +312,12 @@ class Tracker:
         return View.of(self._odometry.steadied(own), camera.T_body_camera)
 
     def _time(self, name: str, camera: MountedCamera, exposed: float) -> float:
-        """Return the time of a neighbour's filter, s, of an exposure by the camera's clock, s."""
+        """Return the time of a neighbor's filter, s, of an exposure by the camera's clock, s."""
         return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
 
     def _measure(self, image: GrayImage, look: Look, name: str,
                  found: Measurement | None) -> None:
-        """Take the measurement of a neighbour near its expected place, if it was found there."""
+        """Take the measurement of a neighbor near its expected place, if it was found there."""
         if found is None:
             return
         if self._of_candidate(look, found):
@@ -342,7 +340,7 @@ class Tracker:
             return MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
         settled = found.doubt < SETTLED and expected.pose is not None and (
             angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
-        return (SMEARED_EVERY if settled else UNSETTLED_EVERY) - 1
+        return SMEARED_EVERY - 1 if settled else 0
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""
@@ -361,16 +359,10 @@ class Tracker:
             self._time(name, look.camera, look.exposed), place.translation) is not None
 
     def _detect(self, image: GrayImage, look: Look) -> None:
-        """Look for the neighbours that are not measured yet."""
+        """Look for the neighbors that are not measured yet."""
         camera, dictionary = look.camera, self.config.dictionary
         due = self._schedule.search_due(camera, look.stamp)
-        rare = self._schedule.has_time_for_all(camera)
-        # The fits to edges and to a smear took the time of the first image without a neighbor.
-        hurried = not rare and all(
-            look.expected[name].pose is not None and name in look.near
-            and not self._schedule.missed_before(name, camera, look.stamp)
-            for name in look.missing)
-        for thorough in (False,) if hurried else (False, True):
+        for thorough in (False, True):
             for name in [n for n in look.near if n not in look.measured and (
                     not thorough or n in look.anywhere)]:
                 pose = look.expected[name].pose
@@ -382,8 +374,9 @@ class Tracker:
         # Unless images are rare, one has time for a thorough search near by, or for a portion.
         near = any(look.expected[name].pose is not None for name in look.missing
                    if name in look.near)
-        camera.searched_near = near and not (due and camera.searched_near or hurried or rare)
-        if not look.missing or not due or camera.searched_near or hurried:
+        camera.searched_near = near and not (due and camera.searched_near) and (
+            not self._schedule.has_time_for_all(camera))
+        if not look.missing or not due or camera.searched_near:
             return
         for _ in range(self._schedule.portions(camera, look.stamp)):
             if look.missing:
@@ -494,7 +487,7 @@ class Tracker:
         return reported(estimate, look.stamp, own, *self._odometry.white_noise)
 
     def _learn(self, camera: MountedCamera, measurement: Measurement, placed: _Placed) -> None:
-        """Learn clock and noise from a neighbour's update with a measurement."""
+        """Learn clock and noise from a neighbor's update with a measurement."""
         name, view = measurement.name, placed.view
         change, estimate = self._filters[name].change, self._filters[name].newest
         if change is not None and estimate is not None:

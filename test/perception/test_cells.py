@@ -39,7 +39,7 @@ def code_of(marker_id: int, dictionary: str = DICTIONARY) -> CellCode:
 
 
 def picture(cells: Any, black: int = 30, white: int = 200) -> GrayImage:
-    """Return a drawing of cells, True where white, amid a quiet zone and a grey background."""
+    """Return a drawing of cells, True where white, amid a quiet zone and a gray background."""
     size = len(cells) + 2 * AROUND
     levels = np.full((size, size), (black + white) // 2)
     levels[AROUND - 1:1 - AROUND, AROUND - 1:1 - AROUND] = white

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Data association: which of those who carry one marker is believed to be the neighbour."""
+"""Data association: which of those who carry one marker is believed to be the neighbor."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Every encoding to grey and back from bytes, rows with padding, and payloads that lie."""
+"""Every encoding to gray and back from bytes, rows with padding, and payloads that lie."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ import pytest
 from flock_follower.perception.images import decode, decode_compressed
 
 GRAY = np.random.default_rng(5).integers(0, 256, (12, 10), dtype=np.uint8)
-COLOURS = {'red': (255, 0, 0), 'green': (0, 255, 0), 'blue': (0, 0, 255)}
+COLORS = {'red': (255, 0, 0), 'green': (0, 255, 0), 'blue': (0, 0, 255)}
 BRIGHTNESS = {'red': 76, 'green': 150, 'blue': 29}  # ITU-R BT.601
 
 
@@ -37,28 +37,28 @@ def decode_array(encoding: str, pixels: np.ndarray, bigendian: bool = False) -> 
     return decode(encoding, height, width, pixels.nbytes // height, bigendian, pixels.tobytes())
 
 
-@pytest.mark.parametrize('colour', COLOURS)
+@pytest.mark.parametrize('color', COLORS)
 @pytest.mark.parametrize('encoding', ['rgb8', 'bgr8', 'rgba8', 'bgra8'])
-def test_colour_becomes_its_brightness(encoding: str, colour: str) -> None:
-    rgb = COLOURS[colour]
+def test_color_becomes_its_brightness(encoding: str, color: str) -> None:
+    rgb = COLORS[color]
     channels = rgb[::-1] if encoding.startswith('bgr') else rgb
     if encoding.endswith('a8'):
         channels = (*channels, 7)
     pixels = np.tile(np.array(channels, dtype=np.uint8), (4, 6, 1))
-    np.testing.assert_array_equal(decode_array(encoding, pixels), BRIGHTNESS[colour])
+    np.testing.assert_array_equal(decode_array(encoding, pixels), BRIGHTNESS[color])
 
 
-@pytest.mark.parametrize('colour', COLOURS)
+@pytest.mark.parametrize('color', COLORS)
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
-def test_bayer_patterns_are_named_by_their_first_row(pattern: str, colour: str) -> None:
-    # A scene of one colour: only the pixels behind filters of that colour are bright.
+def test_bayer_patterns_are_named_by_their_first_row(pattern: str, color: str) -> None:
+    # A scene of one color: only the pixels behind filters of that color are bright.
     mosaic = np.zeros((20, 24), dtype=np.uint8)
     for k, letter in enumerate(pattern):
-        if letter == colour[0]:
+        if letter == color[0]:
             mosaic[k // 2::2, k % 2::2] = 255
     gray = decode_array(f'bayer_{pattern}8', mosaic)
     assert gray.shape == mosaic.shape
-    np.testing.assert_allclose(gray[4:-4, 4:-4], BRIGHTNESS[colour], atol=1)
+    np.testing.assert_allclose(gray[4:-4, 4:-4], BRIGHTNESS[color], atol=1)
 
 
 @pytest.mark.parametrize(('encoding', 'first'), [

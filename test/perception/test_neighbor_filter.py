@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The neighbour filter: motion, consistency, gating, late frames, time jumps, levers."""
+"""The neighbor filter: motion, consistency, gating, late frames, time jumps, levers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ DT = 1.0 / 30.0
 
 
 def truth(t: float) -> Transform:
-    """Return T_odom_body of a neighbour in steady flight, turning about z."""
+    """Return T_odom_body of a neighbor in steady flight, turning about z."""
     return Transform(quaternion_to_matrix(quaternion_from_yaw(0.3 + RATE * t)),
                      START + t * VELOCITY)
 
@@ -61,7 +61,7 @@ def measured(body: Transform, rng: np.random.Generator | None = None) -> Transfo
 
 
 def error(estimate: Estimate, body: Transform, velocity: Array) -> Array:
-    """Return the error state (15,) of an estimate of a neighbour that does not accelerate."""
+    """Return the error state (15,) of an estimate of a neighbor that does not accelerate."""
     return np.concatenate([
         body.translation - estimate.position, velocity - estimate.velocity,
         matrix_to_rotation_vector(body.rotation @ estimate.rotation.T),
@@ -96,7 +96,7 @@ def test_steady_flight_without_noise_is_found_exactly() -> None:
 
 
 def test_errors_agree_with_the_covariance() -> None:
-    # A neighbour that moves as the filter believes: Singer's acceleration, white angular one.
+    # A neighbor that moves as the filter believes: Singer's acceleration, white angular one.
     params = FilterParams(acceleration=0.7, acceleration_time=1.5, angular_noise=1.0,
                           odometry_noise=1e-3)
     nees = []
@@ -220,9 +220,9 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
     assert np.linalg.norm(e[3:6]) < 0.3
 
 
-@pytest.mark.parametrize(('modelled', 'least', 'most'), [(True, 2.0, 4.0), (False, 5.0, 10.0)])
+@pytest.mark.parametrize(('modeled', 'least', 'most'), [(True, 2.0, 4.0), (False, 5.0, 10.0)])
 def test_errors_that_are_alike_from_image_to_image_do_not_average_out(
-        modelled: bool, least: float, most: float) -> None:
+        modeled: bool, least: float, most: float) -> None:
     alike, squares = 0.8 * NOISE, []
     for seed in range(16):
         rng, tracker, same = np.random.default_rng(seed), NeighborFilter(), np.zeros(6)
@@ -233,7 +233,7 @@ def test_errors_that_are_alike_from_image_to_image_do_not_average_out(
             body = truth(k * DT)
             rotation = rotation_vector_to_matrix(e[3:]) @ body.rotation
             seen = Transform(rotation, body.apply(TAIL[None])[0] + e[:3] - rotation @ TAIL)
-            tracker.update(k * DT, seen, TAIL, NOISE, alike=alike if modelled else None)
+            tracker.update(k * DT, seen, TAIL, NOISE, alike=alike if modeled else None)
         estimate = known(tracker.newest)
         np.linalg.cholesky(estimate.covariance)
         off = error(estimate, body, VELOCITY)[:3]
@@ -279,7 +279,7 @@ def test_late_and_repeated_frames_are_dropped_and_jumps_start_anew(
         np.testing.assert_allclose(now(tracker, t).position, truth(t).translation, atol=1e-9)
 
 
-def test_twist_is_given_in_the_neighbours_body() -> None:
+def test_twist_is_given_in_the_neighbors_body() -> None:
     twist = now(tracked(5.0, noisy=False), 5.0).child_twist
     np.testing.assert_allclose(twist[:3], truth(5.0).rotation.T @ VELOCITY, atol=3e-3)
     np.testing.assert_allclose(twist[3:], [0.0, 0.0, RATE], atol=3e-3)

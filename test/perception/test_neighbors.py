@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The neighbours file: what it means, and every way of writing it wrongly."""
+"""The neighbors file: what it means, and every way of writing it wrongly."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def several(*markers: Any, name: Any = 'leader', **changes: Any) -> dict[str, An
             'neighbors': [{'name': name, 'markers': list(markers), **changes}]}
 
 
-def test_a_neighbour_may_carry_several_markers() -> None:
+def test_a_neighbor_may_carry_several_markers() -> None:
     config = parse(several(marker_entry(2), marker_entry(0), marker_entry(1)))
     (leader,) = config.neighbors
     assert [m.marker_id for m in leader.markers] == [2, 0, 1]  # as written
@@ -69,7 +69,7 @@ def test_a_neighbour_may_carry_several_markers() -> None:
         assert config.by_marker()[k] == (leader, marker)
 
 
-def test_a_neighbour_has_a_role_a_radius_and_an_antenna_where_they_are_given() -> None:
+def test_a_neighbor_has_a_role_a_radius_and_an_antenna_where_they_are_given() -> None:
     (plain,) = parse(document()).neighbors
     assert (plain.role, plain.radius, plain.tag_position) == ('leader', 0.0, (0.0, 0.0, 0.0))
     for written in document, lambda **changes: several(marker_entry(0), **changes):
@@ -81,7 +81,7 @@ LEADER = document()['neighbors'][0]
 
 
 def two(**changes: Any) -> dict[str, Any]:
-    """Return a leader, and another neighbour with some values of the leader."""
+    """Return a leader, and another neighbor with some values of the leader."""
     other = {**LEADER, 'name': 'other', 'marker_id': 1, **changes}
     return {'dictionary': 'DICT_4X4_50', 'neighbors': [LEADER, other]}
 

@@ -80,7 +80,7 @@ class Flight:
         return float(np.sqrt(np.mean((self.errors()[:, 2] / ranges)**2)))
 
     def nees(self) -> float:
-        """Return the mean normalised square of the errors of place, per dimension."""
+        """Return the mean normalized square of the errors of place, per dimension."""
         return float(np.mean([e[:3] @ np.linalg.solve(m.covariance[:3, :3], e[:3]) / 3.0
                               for (m, _), e in zip(self.measured, self.errors())]))
 

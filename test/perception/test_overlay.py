@@ -52,7 +52,7 @@ def drawn(T_camera_marker: Transform, stage: str, model: str,
 
 
 def near(canvas: ColorImage, pixel: Array, color: Color) -> bool:
-    """Return whether a colour shows within two pixels of a place."""
+    """Return whether a color shows within two pixels of a place."""
     x, y = np.rint(pixel).astype(int)
     patch = canvas[max(y - 2, 0):y + 3, max(x - 2, 0):x + 3].astype(int)
     return bool((np.abs(patch - np.array(color)).max(axis=2) < 60).any())

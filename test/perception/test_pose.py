@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Neighbours' poses: precision, honest covariances, mirrored attitudes, and several markers."""
+"""Neighbors' poses: precision, honest covariances, mirrored attitudes, and several markers."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def tracked(image: GrayImage, camera: CameraModel, sought: Target, expected: Tra
 
 @pytest.mark.parametrize('model', DISTORTION_MODELS)
 @pytest.mark.parametrize('distance', [1.2, 2.0, 2.8])
-def test_a_tracked_neighbour_is_where_it_is(model: str, distance: float) -> None:
+def test_a_tracked_neighbor_is_where_it_is(model: str, distance: float) -> None:
     camera = make_camera(model)
     rng = np.random.default_rng(8)
     for k in range(2):
@@ -307,7 +307,7 @@ def test_corners_of_no_square_have_no_pose(corners: Array) -> None:
     assert locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior()) is None
 
 
-# Several markers on one neighbour
+# Several markers on one neighbor
 
 PORT = Transform(TAIL.rotation, np.array([-0.2, 0.2, 0.0]))
 STARBOARD = Transform(rotation_vector_to_matrix([0.0, 0.0, 0.3]) @ TAIL.rotation,
@@ -316,7 +316,7 @@ SIDEWAYS = Transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0
                      np.array([0.0, -0.3, 0.0]))  # faces right: seen edge on from behind
 WINGED = target(MarkedNeighbor('winged', (Marker(0, SIDE, PORT), Marker(1, SIDE, STARBOARD),
                                           Marker(2, SIDE, SIDEWAYS))), DICTIONARY)
-#: T_camera_body of a neighbour ahead, a little above, turned by 14 degrees.
+#: T_camera_body of a neighbor ahead, a little above, turned by 14 degrees.
 AHEAD = Transform(rotation_vector_to_matrix([0.0, 0.25, 0.0])
                   @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
                   np.array([0.1, -0.2, 2.4]))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Distances by radio: which are believed, and what is learnt of their errors."""
+"""Distances by radio: which are believed, and what is learned of their errors."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_distances_outside_the_gate_are_refused_or_have_less_weight(
         assert judged == (expected and pytest.approx(expected))
 
 
-def learnt(seed: int, true: float, seconds: float = 20.0, outliers: float = 0.05) -> RangeBias:
-    """Return what is learnt at 20 Hz from ranges of 0.1 m noise, some on a detour up to 1 m."""
+def learned(seed: int, true: float, seconds: float = 20.0, outliers: float = 0.05) -> RangeBias:
+    """Return what is learned at 20 Hz from ranges of 0.1 m noise, some on a detour up to 1 m."""
     bias, rng = RangeBias(), np.random.default_rng(seed)
     for k in range(round(20 * seconds)):
         detour = rng.uniform(0.0, 1.0) if rng.random() < outliers else 0.0
@@ -58,23 +58,23 @@ def learnt(seed: int, true: float, seconds: float = 20.0, outliers: float = 0.05
 
 @pytest.mark.parametrize('true', [-0.3, 0.1])
 def test_the_bias_is_found_through_noise_and_detours(true: float) -> None:
-    errors = np.array([learnt(seed, true).value - true for seed in range(20)])
+    errors = np.array([learned(seed, true).value - true for seed in range(20)])
     assert np.abs(errors).max() < 0.05
     assert abs(errors.mean()) < 0.02  # detours do not pull it along
-    deviation = float(np.sqrt(learnt(0, true).variance(20.0)))
+    deviation = float(np.sqrt(learned(0, true).variance(20.0)))
     assert 0.005 < deviation < 0.03
     assert np.sqrt(np.mean(errors ** 2)) < 1.7 * deviation
 
 
 def test_a_bias_that_jumps_is_followed() -> None:
-    bias, rng = learnt(3, 0.0), np.random.default_rng(4)
+    bias, rng = learned(3, 0.0), np.random.default_rng(4)
     for k in range(200):
         bias.learn(20.0 + k / 20, 0.6 + rng.normal(0.0, 0.1), 0.01)
     assert bias.value == pytest.approx(0.6, abs=0.05)
 
 
-def test_the_bias_becomes_uncertain_where_nothing_is_learnt_and_never_more_than_unknown() -> None:
-    bias = learnt(5, 0.1)
+def test_the_bias_becomes_uncertain_where_nothing_is_learned_and_never_more_than_unknown() -> None:
+    bias = learned(5, 0.1)
     variances = [bias.variance(20.0 + t) for t in (0.0, 5.0, 60.0, 1e6)]
     assert variances == sorted(variances)
     assert variances[-1] == UNKNOWN_BIAS ** 2

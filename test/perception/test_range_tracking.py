@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Ranges in perception: what is dropped and why, what is learnt, and what is told out of sight."""
+"""Ranges in perception: what is dropped and why, what is learned, and reports out of sight."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Rig:
             self.last = found
 
 
-def test_in_sight_the_bias_is_learnt_and_nothing_is_reported() -> None:
+def test_in_sight_the_bias_is_learned_and_nothing_is_reported() -> None:
     rig = Rig(bias=0.25)
     rig.fly(10.0, seen=True)
     assert rig.found == []

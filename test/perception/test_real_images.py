@@ -66,7 +66,7 @@ class Scene:
         self.ids = sorted(truth.get('markers', range(rows * columns)))
         self.image: GrayImage = decode_compressed((DATA / name).read_bytes())
         self.camera = camera_of(name)
-        # Each marker is the tail of a neighbour of its own; the camera looks ahead, level.
+        # Each marker is the tail of a neighbor of its own; the camera looks ahead, level.
         config = parse({'dictionary': truth['dictionary'], 'neighbors': [
             {'name': f'marker{i}', 'marker_id': i, 'side_length': truth['marker_length_m'],
              'position': [0.0, 0.0, 0.0], 'rpy': [np.pi / 2, 0.0, -np.pi / 2]}
@@ -104,11 +104,11 @@ def test_every_marker_of_a_real_grid_is_where_the_grid_says() -> None:
     found, grid = places(Scene(GRID).look()), TRUTH[GRID]
     rows, columns = grid['grid']
     pitch = grid['marker_length_m'] + grid['marker_separation_m']
-    centres = np.array([found[f'marker{i}'].translation for i in range(columns * rows)])
-    neighbours = np.linalg.norm(centres[1:] - centres[:-1], axis=1)
+    centers = np.array([found[f'marker{i}'].translation for i in range(columns * rows)])
+    neighbors = np.linalg.norm(centers[1:] - centers[:-1], axis=1)
     in_a_row = np.arange(1, columns * rows) % columns != 0
-    np.testing.assert_allclose(neighbours[in_a_row], pitch, rtol=0.1)  # markers of 21 to 30 px
-    assert np.mean(neighbours[in_a_row]) == pytest.approx(pitch, rel=0.02)
+    np.testing.assert_allclose(neighbors[in_a_row], pitch, rtol=0.1)  # markers of 21 to 30 px
+    assert np.mean(neighbors[in_a_row]) == pytest.approx(pitch, rel=0.02)
 
 
 #: How far the expected place is off: across the line of sight (2,), in cells of the marker, along

@@ -52,7 +52,7 @@ def body(stamp: float) -> Transform:
 
 
 def ahead(distance: float, left: float, stamp: float = 0.0, up: float = 0.0) -> Transform:
-    """Return the pose of a neighbour ahead of the drone at a stamp, facing away."""
+    """Return the pose of a neighbor ahead of the drone at a stamp, facing away."""
     return Transform(np.eye(3), body(stamp).translation + np.array([distance, left, up]))
 
 
@@ -103,7 +103,7 @@ def rendered(pose: Transform | None, seed: int) -> GrayImage:
 
 
 @pytest.mark.parametrize('later', [0.0, 0.023], ids=['at once', 'in turns'])
-def test_a_neighbour_passes_from_one_image_to_the_next_without_a_gap_or_a_step(
+def test_a_neighbor_passes_from_one_image_to_the_next_without_a_gap_or_a_step(
         later: float) -> None:
     # Above, and seen aslant: both attitudes of a marker that is seen straight on look the same.
     drone, start = Drone(front=FRONT, left=LEFT), Transform.from_quaternion(
@@ -155,7 +155,7 @@ def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
     assert (len(tracked), len(whole)) == (18, 0)  # in the images of the front camera
 
 
-def test_a_neighbour_covered_in_one_image_is_looked_for_there_now_and_then(
+def test_a_neighbor_covered_in_one_image_is_looked_for_there_now_and_then(
         monkeypatch: pytest.MonkeyPatch) -> None:
     drone, tracked = Drone(front=FRONT, left=LEFT), watched(monkeypatch, tracker_module, 'track')
     for k in range(50):
@@ -180,7 +180,7 @@ def test_more_cameras_search_no_more_whole_images(monkeypatch: pytest.MonkeyPatc
     assert len(portions) == pytest.approx(2.0 / PORTION_PERIOD, abs=3)
 
 
-def test_a_neighbour_that_leaves_all_images_is_searched_for_in_all_and_found() -> None:
+def test_a_neighbor_that_leaves_all_images_is_searched_for_in_all_and_found() -> None:
     drone, found = Drone(front=FRONT, back=BACK), list[float]()
     for k in range(10):
         drone.see('front', 0.05 * k, ahead(2.0, 0.0, 0.05 * k))

@@ -123,7 +123,7 @@ def test_a_leader_in_formation_has_the_own_velocity_through_jumps_of_odometry_an
 # Stages
 
 
-def test_the_cheapest_stage_that_finds_the_neighbour_is_used(image: GrayImage) -> None:
+def test_the_cheapest_stage_that_finds_the_neighbor_is_used(image: GrayImage) -> None:
     drone, moved = hovering(), seen({0: aside(0.1)})  # by nearly 4 cells in 50 ms
     for stage, picture, place in ('full', image, LEADER), ('roi', moved, aside(0.1)):
         sighting = drone.see(picture)
@@ -142,25 +142,12 @@ def test_the_cheapest_stage_that_finds_the_neighbour_is_used(image: GrayImage) -
 
 
 @pytest.mark.parametrize(('period', 'stages'), [
-    (1 / 30, ['near', 'near+', 'full', 'near+', 'full']), (0.2, ['full'] * 4)])
+    (1 / 30, ['roi', 'full', 'roi', 'full']), (0.2, ['full'] * 4)])
 def test_the_search_near_takes_turns_with_portions_unless_images_are_rare(
-        monkeypatch: pytest.MonkeyPatch, image: GrayImage, period: float,
-        stages: list[str]) -> None:
-    drone, thorough = hovering(period=period), list[bool]()
-    near = search.near
-
-    def watched(*arguments: Any) -> Any:
-        thorough.append(arguments[5])
-        return near(*arguments)
-
-    monkeypatch.setattr(search, 'near', watched)
+        image: GrayImage, period: float, stages: list[str]) -> None:
+    drone = hovering(period=period)
     drone.see(image)
-    done = []
-    for _ in stages:
-        thorough.clear()
-        stage = drone.see(EMPTY).stage
-        done.append('full' if stage == 'full' else 'near+' if True in thorough else 'near')
-    assert done == stages
+    assert [drone.see(EMPTY).stage for _ in stages] == stages
 
 
 @pytest.mark.parametrize(('rate', 'every', 'most'), [(60.0, 2, 1), (30.0, 1, 1), (7.0, 1, 4)])
@@ -195,7 +182,7 @@ def test_a_track_that_is_lost_after_a_while_is_not_searched_for_in_all_portions_
     for seen in [image] * 15 + [EMPTY] * 12:
         searched.append(0)
         drone.see(seen)
-    assert searched[15:] == [0] + [0, 1] * 5 + [0]
+    assert searched[15:] == [0, 1] * 6
 
 
 def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
@@ -243,10 +230,10 @@ def test_a_detection_turns_a_track_round_that_only_smears_confirm(
     assert max(after[6:]) < 0.05
 
 
-# Several neighbours, several markers, and others
+# Several neighbors, several markers, and others
 
 
-def test_two_neighbours_are_told_apart_and_tracked() -> None:
+def test_two_neighbors_are_told_apart_and_tracked() -> None:
     drone = hovering(NeighborConfig(DICTIONARY, (
         *CONFIG.neighbors, MarkedNeighbor('wing', (Marker(1, SIDE, TAIL),)))))
     wing = aside(-0.8, 0.4, 0.2)
@@ -263,7 +250,7 @@ def test_two_neighbours_are_told_apart_and_tracked() -> None:
     assert all(stages['wing'] == 'track' for stages in back) and back[-1]['leader'] == 'track'
 
 
-def test_markers_of_no_neighbour_are_named_once() -> None:
+def test_markers_of_no_neighbor_are_named_once() -> None:
     others, drone = seen({7: aside(-0.7), 5: aside(0.4, 0.5), 0: LEADER}), hovering()
     assert drone.see(others).other_ids == [5, 7]
     assert drone.see(others).other_ids == []  # nobody missing: nothing was searched

@@ -154,12 +154,12 @@ def rectangles(rng: np.random.Generator) -> Array:
     """Return dark and bright boxes, frames and squares in squares on a texture."""
     image = texture(rng)
     for _ in range(25):
-        centre, size = rng.uniform([0, 0], SIZE), rng.uniform(8.0, 110.0, 2)
+        center, size = rng.uniform([0, 0], SIZE), rng.uniform(8.0, 110.0, 2)
         if rng.random() < 0.5:
             size[1] = size[0]
         angle = rng.uniform(-30.0, 30.0)
         for share in (1.0, 0.66, 0.33)[:rng.integers(1, 4)]:
-            box = cv2.boxPoints((tuple(map(float, centre)), tuple(map(float, share * size)),
+            box = cv2.boxPoints((tuple(map(float, center)), tuple(map(float, share * size)),
                                  float(angle)))
             cv2.fillPoly(image, [box.astype(np.int32)], float(rng.uniform(0, 255)))
     return image
@@ -180,7 +180,7 @@ def board_at_the_marker(rng: np.random.Generator) -> Array:
 
 
 def cells_at_the_marker(rng: np.random.Generator) -> Array:
-    """Return a marker of no neighbour where the marker is expected: random cells."""
+    """Return a marker of no neighbor where the marker is expected: random cells."""
     code = np.pad(rng.random((4, 4)) < 0.5, 1)
     assert not any(np.array_equal(code, np.rot90(marker_code(0), k)) for k in range(4))
     return at_the_marker(rng, np.pad(code, 1, constant_values=True), 1 / 6)

@@ -13,22 +13,22 @@
 # limitations under the License.
 
 """
-Noise learnt from innovations in flight: of the measurements, and of a neighbour's motion.
+Noise learned from innovations in flight: of the measurements, and of a neighbor's motion.
 
 If both are right, the innovations of a Kalman filter are white, of the expected covariance. An
-unmodelled motion makes successive innovations alike. An error of the measurements, white from
+unmodeled motion makes successive innovations alike. An error of the measurements, white from
 image to image, does not. So half the square of the difference of two successive innovations shows
 the noise of the measurements, and their mean over ``MEAN_TIME`` shows the motion (Mehra, "On the
 identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control, 1970).
 
-``LearntNoise``: across the line of sight, the noise is the error of the own attitude, which moves
-a neighbour sideways: errors of the odometry, of its interpolation and of the camera's stamps.
+``LearnedNoise``: across the line of sight, the noise is the error of the own attitude, which moves
+a neighbor sideways: errors of the odometry, of its interpolation and of the camera's stamps.
 Along the line of sight, the noise is anything that changes the marker's apparent size: a rolling
 shutter, a bent print, motion blur. The covariances of measured poses are widened, because the
-errors of neighbouring edges may be alike: the innovations show how much of that is needed.
+errors of neighboring edges may be alike: the innovations show how much of that is needed.
 
-``LearntMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
-follow the motion of a neighbour and the errors of the own velocity.
+``LearnedMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
+follow the motion of a neighbor and the errors of the own velocity.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ import numpy as np
 from flock_follower.geometry import Array, skew
 from flock_follower.perception.measurement import WIDENING
 
-#: Number of innovations over which the noise is learnt; initial count of innovations.
-LEARNT = 120
+#: Number of innovations over which the noise is learned; initial count of innovations.
+LEARNED = 120
 FIRST = 15
 #: The square of an innovation is limited to this many times its variance.
 LIMIT = 16.0
@@ -56,7 +56,7 @@ LEAST_SHARE = 1.0 / WIDENING
 _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
-class LearntNoise:
+class LearnedNoise:
     """
     The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
 
@@ -106,7 +106,7 @@ class LearntNoise:
         """
         Take the change of an innovation: the fields of ``neighbor_filter.Change``.
 
-        :param sight: from the own vehicle to the neighbour (3,), m.
+        :param sight: from the own vehicle to the neighbor (3,), m.
         """
         # In plain numbers: for every image, and so small.
         (x, y, z), (u, v, w, *turn) = sight.tolist(), change.tolist()
@@ -117,7 +117,7 @@ class LearntNoise:
         variance = (x * x * xx + y * y * yy + z * z * zz
                     + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
         across, across_variance = u * u + v * v + w * w - along, xx + yy + zz - variance
-        self._count = min(self._count + 1, LEARNT)
+        self._count = min(self._count + 1, LEARNED)
         # Two axes across, each off by the noise times the distance, in two innovations.
         for_attitude = _excess(across, across_variance) / (4.0 * squared * self._count)
         self._across = min(max(self._across + for_attitude, LEAST * self._initial), MOST**2)
@@ -142,20 +142,20 @@ def _excess(squared: float, expected: float) -> float:
 
 
 #: Time constants, s: of the mean innovation, of the noise that it is compared with, and of the
-#: learnt motion.
+#: learned motion.
 MEAN_TIME: Final = 0.25
 NOISE_TIME: Final = 2.0
 MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
 FACTORS: Final = (0.2, 16.0)
-#: After a longer gap, s, the step is not learnt: the mean restarts, and the factor is at least 1,
+#: After a longer gap, s, the step is not learned: the mean restarts, and the factor is at least 1,
 #: so ``FilterParams`` holds.
 LEARNING_GAP: Final = 0.3
 
 
-class LearntMotion:
-    """Factors of the spectral densities of a neighbour's motion, for each axis of odom."""
+class LearnedMotion:
+    """Factors of the spectral densities of a neighbor's motion, for each axis of odom."""
 
     def __init__(self) -> None:
         self.factors = [1.0] * 3

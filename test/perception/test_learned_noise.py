@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Noise learnt from innovations: of measurements its size, direction and limits; of motion."""
+"""Noise learned from innovations: of measurements its size, direction and limits; of motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception.learnt_noise import LEARNT, LearntMotion, LearntNoise, LEAST_SHARE
+from flock_follower.perception.learned_noise import (
+    LEARNED,
+    LearnedMotion,
+    LearnedNoise,
+    LEAST_SHARE,
+)
 from flock_follower.perception.neighbor_filter import NeighborFilter
 
 SIGHT = np.array([1.2, -1.6, 0.0])  # 2 m away
@@ -30,18 +35,18 @@ UP = np.array([0.0, 0.0, 1.0])
 BASE = 0.001**2 * np.eye(3)  # m^2, what else there is
 
 
-def fed(attitude: float, distance: float, count: int = 4 * LEARNT, seed: int = 1) -> LearntNoise:
-    """Return what was learnt of noise: rad about each axis, and a share of the distance."""
-    learnt, rng = LearntNoise(0.0005), np.random.default_rng(seed)
+def fed(attitude: float, distance: float, count: int = 4 * LEARNED, seed: int = 1) -> LearnedNoise:
+    """Return what was learned of noise: rad about each axis, and a share of the distance."""
+    learned, rng = LearnedNoise(0.0005), np.random.default_rng(seed)
     for _ in range(count):
         true = np.linalg.cholesky(BASE + covariance(attitude, distance))
-        learnt.take(np.sqrt(2.0) * true @ rng.standard_normal(3), expected(learnt), SIGHT)
-    return learnt
+        learned.take(np.sqrt(2.0) * true @ rng.standard_normal(3), expected(learned), SIGHT)
+    return learned
 
 
-def expected(learnt: LearntNoise) -> Array:
+def expected(learned: LearnedNoise) -> Array:
     """Return the covariance of the difference of two measurements, (3, 3)."""
-    return 2.0 * (learnt.shares[0] * BASE + learnt.covariance(SIGHT)[:3, :3])
+    return 2.0 * (learned.shares[0] * BASE + learned.covariance(SIGHT)[:3, :3])
 
 
 def covariance(attitude: float, distance: float) -> Array:
@@ -51,28 +56,28 @@ def covariance(attitude: float, distance: float) -> Array:
 
 @pytest.mark.parametrize(('attitude', 'distance'), [
     (0.002, 0.0), (0.02, 0.0), (0.0, 0.004), (0.0, 0.02)])
-def test_noise_is_learnt_of_the_attitude_across_the_line_of_sight_and_of_the_distance_along_it(
+def test_noise_is_learned_of_the_attitude_across_the_line_of_sight_and_of_the_distance_along_it(
         attitude: float, distance: float) -> None:
-    learnt = fed(attitude, distance)
-    assert learnt.attitude == pytest.approx(attitude, rel=0.25, abs=0.0007)
-    assert learnt.distance == pytest.approx(distance, rel=0.35, abs=0.0005)
+    learned = fed(attitude, distance)
+    assert learned.attitude == pytest.approx(attitude, rel=0.25, abs=0.0007)
+    assert learned.distance == pytest.approx(distance, rel=0.35, abs=0.0005)
 
 
 @pytest.mark.parametrize(('white', 'shares'), [
     (0.8, [0.8, 0.8]), (0.1, [LEAST_SHARE, LEAST_SHARE]), (2.0, [1.0, 1.0])])
-def test_the_share_of_a_poses_variance_that_is_noise_is_learnt_down_to_a_limit(
+def test_the_share_of_a_poses_variance_that_is_noise_is_learned_down_to_a_limit(
         white: float, shares: list[float]) -> None:
-    learnt, rng = LearntNoise(1e-6), np.random.default_rng(3)
+    learned, rng = LearnedNoise(1e-6), np.random.default_rng(3)
     seen = []
-    for k in range(8 * LEARNT):
-        learnt.take(rng.normal(0.0, 0.01 * np.sqrt(2.0 * white), 6),
-                    2.0 * (np.diag(np.repeat(learnt.scales, 3) * 0.01)**2
-                           + learnt.covariance(SIGHT)), SIGHT)
-        if k > 4 * LEARNT:
-            seen.append([*learnt.shares])
+    for k in range(8 * LEARNED):
+        learned.take(rng.normal(0.0, 0.01 * np.sqrt(2.0 * white), 6),
+                    2.0 * (np.diag(np.repeat(learned.scales, 3) * 0.01)**2
+                           + learned.covariance(SIGHT)), SIGHT)
+        if k > 4 * LEARNED:
+            seen.append([*learned.shares])
     np.testing.assert_allclose(np.mean(seen, axis=0), shares, rtol=0.15)
-    learnt.restart()
-    assert learnt.shares == [1.0, 1.0]
+    learned.restart()
+    assert learned.shares == [1.0, 1.0]
 
 
 def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
@@ -85,13 +90,13 @@ def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
     assert added[:3, 5] == pytest.approx(noise.attitude**2 * np.cross(UP, SIGHT))
 
 
-def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearntNoise, float]:
+def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearnedNoise, float]:
     """
-    Follow a neighbour that changes its speed by 1 m/s, at 2 m/s^2, every ``period`` s.
+    Follow a neighbor that changes its speed by 1 m/s, at 2 m/s^2, every ``period`` s.
 
-    Return the noise learnt of measurements that err by 1 mm, and the mean NEES of the velocity.
+    Return the noise learned of measurements that err by 1 mm, and the mean NEES of the velocity.
     """
-    rng, dt, learnt, tracker = np.random.default_rng(seed), 1.0 / 30.0, LearntNoise(0.0005), (
+    rng, dt, learned, tracker = np.random.default_rng(seed), 1.0 / 30.0, LearnedNoise(0.0005), (
         NeighborFilter())
     noise, nees = np.diag([0.001] * 3 + [0.01] * 3)**2, []
     place, velocity = SIGHT, np.array([0.5, 0.0, 0.0])
@@ -106,14 +111,14 @@ def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearntNoise,
         measured = Transform(np.eye(3), place + rng.normal(0.0, 0.001, 3))
         tracker.update(t, measured, np.zeros(3), noise)
         if tracker.change is not None:
-            learnt.take(*tracker.change, place)
+            learned.take(*tracker.change, place)
         if t > 2.0 and tracker.newest is not None:
             error = tracker.newest.velocity - velocity
             nees.append(error @ np.linalg.solve(tracker.newest.covariance[3:6, 3:6], error))
-    return learnt, float(np.mean(nees))
+    return learned, float(np.mean(nees))
 
 
-def test_a_manoeuvre_is_no_noise_of_the_measurements() -> None:
+def test_a_maneuver_is_no_noise_of_the_measurements() -> None:
     tracker, noise, changes = NeighborFilter(), np.diag([0.001] * 3 + [0.01] * 3)**2, []
     for k in range(90):
         ahead = 2.0 + 1.0 * max(k / 30.0 - 1.0, 0.0)**2  # from 1 s on at 2 m/s^2
@@ -122,9 +127,9 @@ def test_a_manoeuvre_is_no_noise_of_the_measurements() -> None:
         if tracker.change is not None:
             changes.append(float(np.abs(tracker.change.difference).max()))
     assert 0.0 < max(changes) < 0.003  # m; the innovations are up to 0.011
-    learnt, _ = flown(2.0, 1)
-    assert learnt.attitude < 0.0005
-    assert learnt.distance < 0.0005
+    learned, _ = flown(2.0, 1)
+    assert learned.attitude < 0.0005
+    assert learned.distance < 0.0005
 
 
 @pytest.mark.parametrize('period', [2.0, 1000.0])
@@ -132,15 +137,15 @@ def test_the_velocity_errs_as_its_covariance_says(period: float) -> None:
     assert 0.3 < np.mean([flown(period, seed)[1] for seed in range(3)]) < 4.5
 
 
-def test_a_neighbour_unseen_may_do_more_than_it_did() -> None:
-    learnt = LearntMotion()
+def test_a_neighbor_unseen_may_do_more_than_it_did() -> None:
+    learned = LearnedMotion()
     for k in range(300):  # it follows every single error: too fast
-        learnt.take(1.0 / 30.0, np.full(3, (-1)**k * 1e-3), 1e-6 * np.eye(3))
-    assert max(learnt.scale(1.0 / 30.0)) < 1.0
-    assert learnt.scale(1.0) == [1.0] * 3
+        learned.take(1.0 / 30.0, np.full(3, (-1)**k * 1e-3), 1e-6 * np.eye(3))
+    assert max(learned.scale(1.0 / 30.0)) < 1.0
+    assert learned.scale(1.0) == [1.0] * 3
 
 
-def test_a_track_that_begins_anew_does_not_keep_the_motion_that_was_learnt() -> None:
+def test_a_track_that_begins_anew_does_not_keep_the_motion_that_was_learned() -> None:
     tracker, rng = NeighborFilter(), np.random.default_rng(5)
     noise = np.diag([0.001] * 3 + [0.01] * 3)**2
     for k in range(300):
