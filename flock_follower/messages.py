@@ -76,7 +76,9 @@ FUTURE_TOLERANCE = 0.1
 #: s: a stamp farther back is a new start (a bag played again), not a message out of order.
 MAX_JUMP = 0.5
 #: m: odometry farther from its prediction has another frame than before: places in the old frame
-#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source.
+#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source. The rules
+#: differ in their prediction (``OdometrySource``, ``planner.memory``, ``peers.leapt``,
+#: ``odometry_forwarding.jumped``, ``velocity_check.Path``), and each says why.
 ODOMETRY_JUMP = 0.25
 #: m: a neighbor's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5

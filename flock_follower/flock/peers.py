@@ -124,7 +124,12 @@ PREDICTION_TIME = 3.0  # s after its last message without which no prediction is
 
 
 def leapt(before: OdometryState, now: OdometryState) -> str:
-    """Return the leap of an odometry between two of its states, as text, or ''."""
+    """
+    Return the leap of an odometry between two of its states, as text, or ''.
+
+    A rule of its own: states of other vehicles come seconds apart, so their motion in between is
+    allowed for, and a leap of the yaw alone turns the frames against each other, too.
+    """
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
     if not 0.0 <= elapsed <= PREDICTION_TIME:
         return ''

@@ -277,7 +277,8 @@ class Path:
     """
     The positions (3,), m, of one source, without jumps; times are monotonic, s.
 
-    Jumps are judged here by one rule for both sources: the autopilot's position counts none.
+    Jumps are judged here by one rule for both sources: the autopilot's position counts none. They
+    are taken out of the path instead of counted: displacements must not contain them.
     """
 
     def __init__(self) -> None:

@@ -124,7 +124,8 @@ class OdometryBuffer:
     #: Attitudes are averaged while drift^2 < this * (step of successive attitudes)^2, which is 2
     #: noise^2: the average errs by drift / 2 and noise / sqrt(AVERAGED), one attitude by noise.
     MAX_DRIFT_RATIO = 2.5
-    #: If the velocity is derived, a position farther from where it led, m, is a correction.
+    #: If the velocity is derived, a position farther from where it led, m, is a correction. A
+    #: tenth of ``POSITION_JUMP``: no jump, but a neighbor would seem to move by it.
     STEP = 0.03
 
     def __init__(self) -> None:

@@ -150,7 +150,12 @@ class DerivedVelocity(_WhiteJerk):
         return self.rate + (stamp - self.stamp) * self.acceleration
 
     def take(self, stamp: float, position: Array) -> float:
-        """Take a position; return how far it jumped, m, else 0."""
+        """
+        Take a position; return how far it jumped, m, else 0.
+
+        By positions alone, as not every source has a velocity that can be trusted: this is the
+        jump that is counted and reported, for ``check``, ``evaluate`` and the diagnostics.
+        """
         dt = stamp - self.stamp
         if not 0.0 < dt <= ODOMETRY_GAP:
             self._begin(stamp, position)

@@ -81,7 +81,9 @@ def update_motions(motions: Mapping[str, Motion],
 
 
 DRAG_TIME = 1.0  # s over which drag is observed
-NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of another vehicle
+#: m: an estimate this far from the prediction is of another vehicle. Not ``ODOMETRY_JUMP``: a
+#: neighbor accelerates unknown to us, and its estimate errs by up to half a meter.
+NEIGHBOR_JUMP = 1.0
 
 
 class Loss(NamedTuple):
@@ -202,6 +204,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
             if me is not None and own.relative is not me.relative:
                 memory, me = memory.in_frame_of(own, now, params), own
                 jumped, drag = own.stamp, memory.drag
+            # From tick to tick, not from message to message: a jump between two ticks counts even
+            # if the message of it was lost, and so does one of many small steps.
             jump = 0.0 if me is None else prediction_error(own, me)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
