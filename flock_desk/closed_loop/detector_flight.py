@@ -264,7 +264,7 @@ class DetectorFlight(Listener):
         if self._has_begun:
             self._accelerations.append(math.hypot(message.afx, message.afy, message.afz))
 
-    def rejected(self, reason: str, detail: str) -> None:
+    def reject(self, reason: str, detail: str) -> None:
         self._reasons[reason] += 1
 
 
