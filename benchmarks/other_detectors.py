@@ -16,7 +16,8 @@
 Fly scenarios in lock step on the poses of simulated detectors that are not ours.
 
 ``python benchmarks/other_detectors.py [--scenario NAME ...] [--seeds N] [--duration S]``: prints
-a row for each flight; exit code 1 if a bound of BOUNDS does not hold.
+a row for each flight; exit code 1 if a bound does not hold. ``--acceleration`` and
+``--acceleration_time`` are the parameters of relative_pose.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import sys
 from flock_desk.closed_loop.detector_flight import DetectorFlight, DETECTORS, Figures
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.bags.message_types import empty
+from flock_follower.perception.neighbor_motion import FilterParams
 
 SCENARIOS = ('indoor', 'random_walk', 'circle')
 NEAREST = 0.9  # m
@@ -50,15 +52,21 @@ def main() -> int:
     parser.add_argument('--detector', nargs='+', default=[*DETECTORS], choices=[*DETECTORS])
     parser.add_argument('--seeds', type=int, default=3)
     parser.add_argument('--duration', type=float, default=60.0, help='s')
+    parser.add_argument('--acceleration', type=float, default=FilterParams.acceleration)
+    parser.add_argument('--acceleration_time', type=float,
+                        default=FilterParams.acceleration_time)
     options = parser.parse_args()
+    params = FilterParams(acceleration=options.acceleration,
+                          acceleration_time=options.acceleration_time)
     failed = False
     print('scenario, detector, seed: in band, nearest m, farthest m, |a| m/s^2, |v| m/s, TRACK')
     for seed in range(options.seeds):
         for name in options.scenario:
             scenario = load(name)
             for detector in options.detector:
-                figures = DetectorFlight(scenario, seed, DETECTORS[detector], empty).fly(
-                    min(options.duration, scenario.duration))
+                figures = DetectorFlight(
+                    scenario, seed, DETECTORS[detector], empty, params).fly(
+                        min(options.duration, scenario.duration))
                 wrong = faults(detector, figures, scenario.flight.a_max)
                 failed |= bool(wrong)
                 numbers = ', '.join(f'{value:.3f}' for value in figures[:-1])

@@ -127,7 +127,7 @@ class Listener:
     def send(self, time: int, messages: list[OdometryState]) -> None:
         """Take messages to other followers, at a time in ns."""
 
-    def rejected(self, reason: str, detail: str) -> None:
+    def reject(self, reason: str, detail: str) -> None:
         """Take the reason why something was dropped."""
 
 
@@ -259,7 +259,7 @@ class Follower:
 
     def _take_motion(self, time: int, state: OdometryState) -> None:
         if self.perceiver is not None and self.perceiver.take_odometry(state):
-            self._listener.rejected(*JUMPED)
+            self._listener.reject(*JUMPED)
         self.planner.take_odometry(state, time)
 
     def camera_info(self, time: int, message: Any, camera: str = '') -> None:
@@ -279,7 +279,7 @@ class Follower:
         self.advance(time)
         if self.perceiver is not None and (
                 dropped := self.perceiver.take_image(message, stamp, self._seconds(), camera)):
-            self._listener.rejected(LAGGING, '')
+            self._listener.reject(LAGGING, '')
             self._listener.image(ImageOutcome(dropped.stamp_ns, camera=dropped.camera))
         self._process_due()
 
@@ -288,7 +288,7 @@ class Follower:
         self.advance(time)
         if self.perceiver is not None:
             if (rejection := self.perceiver.take_range(measured)) is not None:
-                self._listener.rejected(*rejection)
+                self._listener.reject(*rejection)
             self._use_ranges(self.perceiver)
 
     def pose(self, time: int, name: str, state: PoseState) -> None:
@@ -297,7 +297,7 @@ class Follower:
         if self.perceiver is not None:
             rejection = self.perceiver.take_pose(name, state, self._seconds())
             if rejection is not None:
-                self._listener.rejected(*rejection)
+                self._listener.reject(*rejection)
             self._use_sources(self.perceiver)
 
     def source_frame(self, time: int, stamp: int) -> None:
@@ -318,7 +318,7 @@ class Follower:
         try:
             self.planner.take_neighbor(state, received)
         except ValueError as error:
-            self._listener.rejected('invalid neighbors', str(error))
+            self._listener.reject('invalid neighbors', str(error))
 
     def frame(self, time: int, stamp: int) -> None:
         """Take the stamp of a processed image, ns, with a neighbor in it or not."""
@@ -392,7 +392,7 @@ class Follower:
         while (seen := perceiver.process(self._seconds(), self._cpu_time)) is not None:
             image, sighting = seen.image, seen.sighting
             for rejection in sighting.rejections:
-                self._listener.rejected(*rejection)
+                self._listener.reject(*rejection)
             for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
                 self._publish_neighbor(perceiver, image.stamp_ns, name, estimate)
             if self._make is not None:
@@ -412,19 +412,19 @@ class Follower:
             elif isinstance(outcome, Sourced):
                 sighting = outcome.sighting
                 for rejection in sighting.rejections:
-                    self._listener.rejected(*rejection)
+                    self._listener.reject(*rejection)
                 for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
                     self._publish_neighbor(perceiver, outcome.stamp, name, estimate)
                 self._listener.image(ImageOutcome(outcome.stamp, sighting))
             else:
-                self._listener.rejected(*outcome)
+                self._listener.reject(*outcome)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
         for outcome in perceiver.tracker.ranging.due():
             if isinstance(outcome, Ranged):
                 self._publish_neighbor(perceiver, outcome.stamp, outcome.name, outcome.estimate)
             else:
-                self._listener.rejected(*outcome)
+                self._listener.reject(*outcome)
 
     def _publish_neighbor(self, perceiver: Perceiver, stamp: int, name: str,
                           estimate: Estimate) -> None:
@@ -446,14 +446,14 @@ class Follower:
             if messages := self.sharing.messages(self._now):
                 self._listener.send(self._now, messages)
             for event in self.sharing.new_events():
-                self._listener.rejected(*event)
+                self._listener.reject(*event)
         start = self._cpu_time()
         bridge_age = (0.0 if self._bridge_ended is None
                       else (self._now - self._bridge_ended) * 1e-9)
         decision, command = self.planner.tick(self._now, self.params, bridge_age)
         cpu = self._cpu_time() - start
         for rejection in decision.rejected:
-            self._listener.rejected(*rejection)
+            self._listener.reject(*rejection)
         if decision.state is not self._state:
             self._state = decision.state
             if self._make is not None:
@@ -469,7 +469,7 @@ class Follower:
                 age, source_age = command.ages(self._now)
                 if refused := self._control.take_command(
                         command, age, self._seconds(), source_age):
-                    self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
+                    self._listener.reject(f'command {refused}', f'stamp {age:.3f} s old')
         self._listener.tick(Tick(self._now, decision, self.planner.memory.own, cpu))
 
     def _send(self) -> None:
@@ -480,7 +480,7 @@ class Follower:
             age = stamp_age(state.stamp, self._gate_received)
             if refused := control.take_motion(
                     self._source, MotionReport.from_odometry(state), age, received):
-                self._listener.rejected(f'odom {refused}', '')
+                self._listener.reject(f'odom {refused}', '')
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start
         if setpoint.kind != NONE and self._make is not None:

@@ -52,6 +52,7 @@ from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.messages import from_odometry, Make, NANOSECONDS, odometry
 from flock_follower.neighbors_file import parse
+from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.tracker import Tracker
 from flock_follower.planner.loop import PlannerLoop
@@ -115,9 +116,11 @@ class DetectorFlight(Listener):
     One run of a scenario on the poses of a detector.
 
     :param make: returns an empty message of a type.
+    :param params: of the motion of neighbors.
     """
 
-    def __init__(self, scenario: Scenario, run: int, detector: Detector, make: Make) -> None:
+    def __init__(self, scenario: Scenario, run: int, detector: Detector, make: Make,
+                 params: FilterParams | None = None) -> None:
         self._detector, self._make = detector, make
         self._band = scenario.flight
         self._vehicle = EmbeddedVehicle(0.0, scenario.start.altitude)
@@ -129,7 +132,7 @@ class DetectorFlight(Listener):
         gate.autopilot = AutopilotTraits(PX4.hover_thrust, not PX4.compensates_wind)
         tracker = Tracker(parse({'frames_topic': 'detections', 'neighbors': [{
             'name': LEADER, 'pose_topic': 'poses', 'position_only': detector.position_only}]}),
-            T_BODY_OPTICAL)
+            T_BODY_OPTICAL, params)
         self._follower = Follower(
             PlannerLoop(), scenario.flight.planner(True), gate, self, make,
             perceiver=Perceiver(tracker, max_wait=POSES_WAIT))
@@ -261,7 +264,7 @@ class DetectorFlight(Listener):
         if self._has_begun:
             self._accelerations.append(math.hypot(message.afx, message.afy, message.afz))
 
-    def rejected(self, reason: str, detail: str) -> None:
+    def reject(self, reason: str, detail: str) -> None:
         self._reasons[reason] += 1
 
 

@@ -261,14 +261,14 @@ class Evaluation(Listener):
                 stamp = read_stamp(message.header.stamp)
         except ValueError as error:
             self.follower.advance(time)
-            self.rejected(INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
+            self.reject(INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
             if name == RAW_IMAGES:
                 self.image(ImageOutcome(time, camera=camera))
             return
         # Outside of the try: an error in the follower is no fault of the message.
         if name == 'odom':
             for event in self.source.new_events():
-                self.rejected(*event)
+                self.reject(*event)
             if state is not None:
                 self.follower.odometry(time, state)
         elif name == 'ranges':
@@ -352,7 +352,7 @@ class Evaluation(Listener):
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
 
-    def rejected(self, reason: str, detail: str) -> None:
+    def reject(self, reason: str, detail: str) -> None:
         """Take the reason why something was dropped."""
         self.rejections[reason] += 1
         if self.own is not None:

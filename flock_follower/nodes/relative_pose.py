@@ -241,7 +241,7 @@ class RelativePose(FlockNode):
             while (seen := self._perceiver.process(
                     time.monotonic(), time.monotonic, self._shown)) is not None:
                 self._publish(seen.image.stamp_ns, seen.sighting)
-                for topic, pose in self._perceiver.poses(make, seen, self._subscribed):
+                for topic, pose in self._perceiver.poses(make, seen, self._has_subscriber):
                     self._poses[topic].publish(pose)
                 if seen.usable:  # after the estimates: the planner has them when it receives this
                     self._frames.publish(Header(
@@ -297,7 +297,7 @@ class RelativePose(FlockNode):
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
 
-    def _subscribed(self, topic: str) -> bool:
+    def _has_subscriber(self, topic: str) -> bool:
         return self._poses[topic].get_subscription_count() > 0
 
     def _shown(self, name: str) -> bool:

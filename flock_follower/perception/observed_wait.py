@@ -18,21 +18,19 @@ from __future__ import annotations
 
 from collections import deque
 
-#: A message is late after LATE_FACTOR times the longest observed wait, and LATE_MARGIN.
-LATE_FACTOR = 1.5
 LATE_MARGIN = 0.03  # s
 N_OBSERVED = 50  # newest waits that count
 
 
 class ObservedWait:
     """
-    Waits a little longer than was necessary lately, and never longer than ``max_wait``.
+    Waits for ``factor`` times the longest observed wait and LATE_MARGIN, at most ``max_wait``, s.
 
-    :param needed: number of observed waits before the limit is shorter than ``max_wait``, s.
+    :param needed: number of observed waits before the limit is shorter than ``max_wait``.
     """
 
-    def __init__(self, max_wait: float, needed: int = N_OBSERVED) -> None:
-        self._max_wait, self._needed = max_wait, needed
+    def __init__(self, max_wait: float, factor: float, needed: int) -> None:
+        self._max_wait, self._factor, self._needed = max_wait, factor, needed
         self._waits: deque[float] = deque(maxlen=N_OBSERVED)
 
     @property
@@ -40,7 +38,7 @@ class ObservedWait:
         """Return for how long to wait now, s."""
         if len(self._waits) < self._needed:
             return self._max_wait
-        return min(LATE_FACTOR * max(self._waits) + LATE_MARGIN, self._max_wait)
+        return min(self._factor * max(self._waits) + LATE_MARGIN, self._max_wait)
 
     def observe(self, waited: float) -> None:
         """Take a wait that ended with the awaited message, s."""

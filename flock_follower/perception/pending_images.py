@@ -40,13 +40,14 @@ from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
-from flock_follower.perception.observed_wait import ObservedWait
+from flock_follower.perception.observed_wait import N_OBSERVED, ObservedWait
 from flock_follower.perception.pose_sources import PoseSources
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
 from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseState
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
+LATE_FACTOR = 1.5  # longest wait for odometry, times that observed
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -114,7 +115,7 @@ class Perceiver:
         self.tracker = tracker
         self.frame = ''
         self._choice = OdometryChoice()
-        self._wait = ObservedWait(max_wait)  # of images for odometry
+        self._wait = ObservedWait(max_wait, LATE_FACTOR, N_OBSERVED)  # of images for odometry
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self.sources = PoseSources(tracker, max_wait)
         self._epoch: int | None = None

@@ -112,7 +112,7 @@ class PoseSources:
         self.static = StaticFrames()
         self._tracker, self._max_wait = tracker, max_wait
         self._with_frames = bool(config.frames_topic)
-        self._wait = ObservedWait(max_wait, needed=1)  # of frames for their poses
+        self._wait = ObservedWait(max_wait, 1.0, needed=1)  # of frames for their poses
         self.restart()
 
     def restart(self) -> None:

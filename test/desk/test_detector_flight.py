@@ -27,7 +27,8 @@ INDOOR = load('indoor')
 
 
 def flown(duration: float, **changes: float) -> Figures:
-    return DetectorFlight(INDOOR, 0, replace(DETECTORS['degraded'], **changes), empty).fly(duration)
+    detector = replace(DETECTORS['degraded'], **changes)
+    return DetectorFlight(INDOOR, 0, detector, empty).fly(duration)
 
 
 def test_late_slow_poses_with_gaps_and_outliers_hold_the_band() -> None:

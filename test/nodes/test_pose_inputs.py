@@ -17,12 +17,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from driven import START
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo
@@ -31,7 +32,16 @@ from test_relative_pose_node import AHEAD, calibration, LEADER, Rig, VELOCITY
 from flock_follower.messages import from_odometry
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
-from flock_follower.perception.pose_sources import NO_COVARIANCE, TWO_PUBLISHERS
+from flock_follower.nodes.support.pose_inputs import INVALID_FRAME
+from flock_follower.perception.pose_sources import (
+    INVALID,
+    INVALID_COVARIANCE,
+    NO_ATTITUDE,
+    NO_COVARIANCE,
+    TWO_PUBLISHERS,
+    UNKNOWN_FRAME,
+    UNTIMELY,
+)
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pose_messages import pose_with_covariance
 
@@ -120,6 +130,35 @@ def test_two_publishers_are_refused_until_one_is_left(
     r.node._sources.look()
     r.give('poses', pose(0.07))
     assert len(r.found) == 2 and r.counters[TWO_PUBLISHERS] == 1
+
+
+@pytest.mark.parametrize(('change', 'reason'), [
+    (lambda sent: setattr(sent.header, 'frame_id', 'map'), UNKNOWN_FRAME),
+    (lambda sent: setattr(sent.header.stamp, 'sec', 5), UNTIMELY),
+    (lambda sent: setattr(sent.header.stamp, 'nanosec', 2_000_000_000), 'invalid /poses'),
+    (lambda sent: setattr(sent.pose.pose.position, 'x', math.nan), INVALID),
+    (lambda sent: setattr(sent.pose.pose, 'orientation', Quaternion(w=0.0)), NO_ATTITUDE),
+    (lambda sent: setattr(sent.pose, 'covariance', np.zeros(36)), NO_COVARIANCE),
+    (lambda sent: setattr(sent.pose, 'covariance', -np.eye(6).ravel()), INVALID_COVARIANCE)])
+def test_of_bad_poses_nothing_is_published(
+        rig: Callable[..., Rig], change: Callable[[Any], Any], reason: str) -> None:
+    r = rig()
+    r.odom(0.0)
+    r.odom(0.1)
+    sent = pose(0.05)
+    change(sent)
+    r.give('poses', sent)
+    assert not r.found and r.counters == {reason: 1}
+
+
+def test_a_frame_with_an_invalid_stamp_is_counted(rig: Callable[..., Rig]) -> None:
+    r = rig()
+    r.odom(0.0)
+    r.odom(0.1)
+    bad = info(0.05)
+    bad.header.stamp.nanosec = 2_000_000_000
+    r.give('camera_info', bad)
+    assert r.frames == [] and r.counters == {INVALID_FRAME: 1}
 
 
 def test_a_pose_without_covariance_needs_deviations(

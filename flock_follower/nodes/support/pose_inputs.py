@@ -40,6 +40,7 @@ from flock_follower.perception.pose_sources import (
 )
 from flock_follower.pose_messages import from_pose, POSE_TYPES, stamp_of, TRANSFORMS
 
+INVALID_FRAME = 'invalid frame of another detector'
 LOOK_PERIOD = 0.5  # s between two looks at the publishers of the topics
 N_POSES_JUDGED = 50  # newest poses whose latency and outliers are judged
 
@@ -119,7 +120,12 @@ class PoseInputs:
         self._subscribed.add(self._frames)
 
     def _take_frame(self, data: bytes) -> None:
-        self._perceiver.take_frame(stamp_of(data), time.monotonic())
+        try:
+            stamp = stamp_of(data)
+        except ValueError as error:
+            self._node.diagnostics.reject(INVALID_FRAME, str(error))
+            return
+        self._perceiver.take_frame(stamp, time.monotonic())
         self._process()
 
     def _take_transforms(self, message: Any) -> None:
