@@ -71,6 +71,9 @@ class Wire:
             elif message.get_type() == 'COMMAND_LONG' and (
                     message.command == mavlink.MAV_CMD_DO_SET_MODE):
                 self.modes.append((time.monotonic(), message))
+            elif message.get_type() == 'TIMESYNC' and not message.tc1:
+                # Its clock stands, so the age of its messages stays unknown.
+                self._link.mav.timesync_send(1, message.ts1)
 
     def close(self) -> None:
         self._running = False

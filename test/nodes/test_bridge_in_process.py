@@ -428,17 +428,20 @@ def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_r
     assert bench.values['firmware'] == '1.20.0'
 
 
-@pytest.mark.parametrize('armed', [False, True])
-def test_a_node_with_other_parameters_in_flight_is_named(make_bench, armed):
+@pytest.mark.parametrize(('name', 'armed'), [
+    ('planner', False), ('planner', True), ('perception', True)])
+def test_a_node_with_other_parameters_in_flight_is_named(make_bench, name, armed):
     bench = make_bench()
     bench.beat(armed=armed)
     bench.wait(lambda: bench.bridge.telemetry.status is not None)
-    planner = bench.node._report.problems.planner
-    planner.take({'v_max': 0.5, 'd0': 1.0})
+    node = getattr(bench.node._report.problems, name)
+    node.take({'v_max': 0.5, 'd0': 1.0})
     assert 'changed in flight' not in bench.problems()
-    planner.take({'v_max': 0.5, 'd0': 2.0})  # a planner that was started with another file
-    assert ('parameters of planner changed in flight: d0 1.0 -> 2.0' in bench.problems()) == armed
-    planner.take({'v_max': 0.5, 'd0': 2.0})
+    node.take({'v_max': 0.5, 'd0': 2.0})  # it was started with another file
+    other = {'planner': 'planner', 'perception': 'relative_pose'}[name]
+    assert (f'parameters of {other} changed in flight: d0 1.0 -> 2.0' in
+            bench.problems()) == armed
+    node.take({'v_max': 0.5, 'd0': 2.0})
     assert ('d0 1.0 -> 2.0' in bench.problems()) == armed
 
 

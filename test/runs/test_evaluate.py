@@ -30,6 +30,7 @@ import pytest
 
 from flock_desk.evaluate import main
 from flock_desk.runs.evaluation import topics_used
+from flock_follower.bags import live_line
 from flock_follower.bags.bag import BagError, BagMessage, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
@@ -221,8 +222,10 @@ def test_after_a_gap_all_begins_anew_and_figures_leave_it_out(tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_bytes_that_are_no_message_are_counted_and_said(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bytes_that_are_no_message_are_counted_and_the_progress_is_shown(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_line, 'LOG_PERIOD', 0.0)  # as of a long bag
     count = Counter[str]()
 
     def cut(message: BagMessage) -> BagMessage:
@@ -233,7 +236,8 @@ def test_bytes_that_are_no_message_are_counted_and_said(
     assert main([str(spoilt), '--output', str(tmp_path / 'out')]) == 0
     rejections = summary(tmp_path / 'out')['rejections']
     assert (rejections['invalid odom'], rejections['invalid image']) == (1, 1)
-    assert 'odom: 1 of 240' in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert 'odom: 1 of 240' in error and '50% of bag\n' in error
 
 
 def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Path) -> None:

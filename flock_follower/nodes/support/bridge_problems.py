@@ -72,7 +72,7 @@ class BridgeProblems:
         self._bytes = (self._start, 0, 0)
         self.commanders = SolePublisher(node, 'command/trajectory')
         self.planner = WatchedParameters(node, 'planner', self._is_armed)
-        perception = WatchedParameters(node, 'relative_pose', self._is_armed)
+        self.perception = WatchedParameters(node, 'relative_pose', self._is_armed)
         node.diagnostics.sources += [self._vehicle_values, self._gate_values, self._link_values]
         node.diagnostics.checks += [
             self._setpoint_problem, self._publisher_problem,
@@ -83,7 +83,7 @@ class BridgeProblems:
                 (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
                 (WARN, self._planner_differs), (WARN, self.planner.changed_in_flight),
-                (WARN, perception.changed_in_flight), (WARN, self._heights_differ),
+                (WARN, self.perception.changed_in_flight), (WARN, self._heights_differ),
                 (WARN, self._battery_unknown)))]
 
     def take(self, cycle: Cycle, now: float) -> None:
