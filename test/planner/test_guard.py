@@ -110,7 +110,8 @@ def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_m
     level = guard(a, v, sort_bounds(one), A_MAX, 100.0, T).acceleration[:2]
     n, most = np.array(one[0].normal[:2]), math.sqrt(A_MAX ** 2 - a[2] ** 2)
     lowest, highest = np.clip([one[0].least, -one[1].least], -most, most)
-    radial = np.clip(n @ a[:2], lowest, highest)
+    # Where they contradict each other, separation comes before cohesion.
+    radial = np.clip(n @ a[:2], lowest, max(lowest, highest))
     across = a[:2] - (n @ a[:2]) * n
     room = math.sqrt(most ** 2 - radial ** 2)
     length = np.linalg.norm(across)
