@@ -31,7 +31,7 @@ class MemoryLine:
     def reopen(self, now):
         pass
 
-    def congested(self):
+    def is_congested(self):
         return False
 
     def read(self):

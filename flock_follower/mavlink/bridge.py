@@ -145,7 +145,7 @@ class Bridge:
         """Return the text of ``mavlink_bridge/state`` at ``now``, s: the state and its reason."""
         permission = self.gate.permission
         announced, idle = permission.announcement(), permission.phase is Phase.INACTIVE
-        if idle and (unreceived := self.housekeeping.unreceived(now)):
+        if idle and (unreceived := self.housekeeping.unreceived_reason(now)):
             announced = f'{permission.phase.value}: {unreceived}'
         return first_reason(
             (self.telemetry.dialect is None, f'{NO_AUTOPILOT}: no HEARTBEAT yet'),
@@ -168,15 +168,15 @@ class Bridge:
         velocity = np.array([east, north, self.gate.corrected_climb_rate(up, now)])
         return self.forwarder.take(state._replace(velocity=velocity), time, now)
 
-    def distrusted(self, now: float) -> str:
+    def velocity_fault(self, now: float) -> str:
         """Return why the autopilot's own velocity is invalid, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)
-        return estimator_health.distrusted(
+        return estimator_health.velocity_fault(
             self.telemetry.estimator, self.telemetry.gps, forwarded, now)
 
     def refusal(self, now: float) -> str:
         """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""
-        return self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
+        return self.requests.offboard_obstacle(now, bool(self.telemetry.is_flying(now)))
 
     def unready(self, now: float) -> str | None:
         """Return the reasons against the service ``arm``, '' without any; None: unknown."""
@@ -185,7 +185,7 @@ class Bridge:
                 not self.housekeeping.has_reasons(now)):
             return None
         against = self.texts.unready(now, dialect.arming_mode(status.mode))
-        return against and estimator_health.explained(against, self.telemetry.estimator, now)
+        return against and estimator_health.explain_refusal(against, self.telemetry.estimator, now)
 
     # The setpoint thread.
 
@@ -199,7 +199,7 @@ class Bridge:
             gps = self.telemetry.gps
             report = MotionReport(position.velocity, position=position.position,
                                   std=0.0 if gps is None else gps.accuracy)
-            if refused := self.distrusted(now) or self.gate.take_motion(
+            if refused := self.velocity_fault(now) or self.gate.take_motion(
                     AUTOPILOT, report, self._age(position, now), now):
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
         if attitude is not None and attitude.time == now:
@@ -256,7 +256,7 @@ class Bridge:
         self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
         # On a line too slow for all, setpoints go first.
-        if self._reports and self.alive(now) and not self.link.transport.congested():
+        if self._reports and self.alive(now) and not self.link.transport.is_congested():
             for message in self.ground_station.due(self._boot_time(now), now):
                 self.link.send(message)
         first = accepted if sent and accepted is not self._last_command else None
@@ -265,7 +265,7 @@ class Bridge:
 
     def _decide(self, now: float) -> tuple[Setpoint, AcceptedCommand | None]:
         return self.gate.decide(now, self.telemetry.silence(now), self.withheld(),
-                                self.distrusted(now), self.telemetry.mode_age(now))
+                                self.velocity_fault(now), self.telemetry.mode_age(now))
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
         return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
@@ -291,7 +291,7 @@ class Bridge:
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
         """Set the zero of heights: the place of arming; home if the arming was not observed."""
-        heights, flying = self.gate.heights, self.telemetry.flying(now)
+        heights, flying = self.gate.heights, self.telemetry.is_flying(now)
         armed_now, self._armed = status.armed and self._armed is False, status.armed
         if not status.armed:
             heights.refer(None, now)
@@ -332,7 +332,7 @@ class Bridge:
             return
         for message in self.forwarder.messages(self.telemetry.dialect, now):
             # On a line too slow for both, setpoints go first.
-            room = not self.link.transport.congested()
+            room = not self.link.transport.is_congested()
             self.forwarder.sent(room and self.link.send(message), now)
 
     def stop(self, now: float) -> None:
@@ -341,7 +341,7 @@ class Bridge:
         self.requests.stopping = True
         self.gate.permit(self.gate.permission.end('the bridge is stopping'))
 
-    def stopped(self, now: float) -> bool:
+    def has_stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
         return not self.gate.flies or (self.gate.speed(now) or 0.0) < REST_SPEED or (
             now - self._stopping_since >= STOP_TIMEOUT)
@@ -371,7 +371,7 @@ class Bridge:
             self.gate.permit(self.gate.permission.reset(
                 'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
         flew = self.gate.permission.flies
-        self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.flying(now))
+        self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.is_flying(now))
         if self.gate.permission.flies and not flew:
             self.sticks.begin(now)
         if self.gate.permission.phase is not Phase.TAKEN_OVER:

@@ -219,7 +219,7 @@ class Request:
         :param vehicle: its state now, None if no HEARTBEAT is fresh.
         :param streaming_for: time for which setpoints have been sent without a gap, s.
         """
-        if self.outcome is not None or (vehicle is not None and self._shown(vehicle, now)):
+        if self.outcome is not None or (vehicle is not None and self._is_shown(vehicle, now)):
             return None
         if not self._attempts:
             missing = first_reason(
@@ -240,7 +240,7 @@ class Request:
         elif waited >= (CONFIRM_TIMEOUT if self._result is None else self.current.timeout):
             holds = vehicle is not None and vehicle.status.mode == self._dialect.hold
             late = None if holds else self.current.too_late
-            self._fail(self._unconfirmed(vehicle, texts), late or instead, vehicle, now)
+            self._fail(self._unconfirmed_reason(vehicle, texts), late or instead, vehicle, now)
         elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
                 # The ACK does not identify the request: it may answer an earlier mode command. If
                 # it answers this one, the pilot may have left the mode between two HEARTBEATs:
@@ -254,13 +254,13 @@ class Request:
         self._finish(False, f'{self.goal.name} refused: {message}')
         return self
 
-    def _shown(self, vehicle: Vehicle, now: float) -> bool:
+    def _is_shown(self, vehicle: Vehicle, now: float) -> bool:
         """Return whether the vehicle shows that there is nothing to send at ``now``, s."""
         self._mode = self._mode or vehicle.status.mode
         insists = self.current.insists or self._superseded is not None
         if self.current.reached(vehicle) and (self._attempts or not insists):
             if vehicle.shown_time > self._since:
-                self._reached(vehicle, now)
+                self._note_reached(vehicle, now)
                 return True
             # The next HEARTBEAT shows whether it is still so.
             if not self._attempts and now - self._since < STREAM_TIMEOUT:
@@ -269,7 +269,7 @@ class Request:
             self.refuse(reason)
         return bool(reason)
 
-    def _reached(self, vehicle: Vehicle, now: float) -> None:
+    def _note_reached(self, vehicle: Vehicle, now: float) -> None:
         if self._next is not None:
             goal, self._next = self._next, None
             self._begin(goal, now, vehicle.status.mode)
@@ -310,7 +310,7 @@ class Request:
         result = enum_name('MAV_RESULT', self._result).lower().replace('_', ' ')
         return ': '.join(filter(None, (f'{self.current.name} refused', result, reasons)))
 
-    def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
+    def _unconfirmed_reason(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         shown = 'no HEARTBEAT comes' if vehicle is None else _status(vehicle)
         problem = (f'{self.current.name}: no answer to {self._attempts} commands'
                    if self._result is None else

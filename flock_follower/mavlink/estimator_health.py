@@ -87,7 +87,7 @@ def estimator_status(message: Any, dialect: Dialect, now: float) -> EstimatorSta
         name for flag, name in _NEEDED.items() if not flags & flag))
 
 
-def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
+def explain_refusal(refusal: str, status: EstimatorStatus | None, now: float) -> str:
     """Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks."""
     if status is None or now - status.time > STATUS_TIMEOUT or not status.missing:
         return refusal
@@ -102,7 +102,7 @@ def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
     return GpsFix(fixed, now if before.fixed and not fixed else before.lost, accuracy)
 
 
-def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
+def velocity_fault(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
                now: float) -> str:
     """
     Return why the autopilot's velocity is invalid at ``now``, s, or ''.
@@ -165,7 +165,7 @@ class Arrivals:
         return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
 
 
-def misplaced(position: Array | None, home: Array | None, odometry: Array | None) -> str:
+def find_misplacement(position: Array | None, home: Array | None, odometry: Array | None) -> str:
     """
     Return why the estimate cannot be the vehicle's place, or ''.
 

@@ -100,7 +100,7 @@ class GlobalOrigin:
     def _before_odometry(self, switch: str, gps: float | None, now: float) -> None:
         telemetry = self._link.telemetry
         status, estimator = telemetry.status, telemetry.estimator
-        flying = telemetry.flying(now)
+        flying = telemetry.is_flying(now)
         if flying or (flying is None and status is not None and status.armed) or gps:
             self.obstacle, self.awaited = '', False
             return

@@ -227,11 +227,11 @@ class Housekeeping:
     def changes(self) -> list[str]:
         """Return the parameters that a rule depends on and that have just changed in flight."""
         status = self._link.telemetry.status
-        return self.watch.step(self.parameters.values, self.parameters.watched(),
+        return self.watch.step(self.parameters.values, self.parameters.watched_names(),
                                status is not None and status.armed)
 
     def _request_reasons_in_time(self, now: float) -> None:
-        status, answered = self._link.telemetry.status, self._link.questions.answered(REASONS)
+        status, answered = self._link.telemetry.status, self._link.questions.answer_time(REASONS)
         if math.isinf(self._reasons_since) and math.isfinite(answered):
             self._reasons_since = answered
         period = WHY_PERIOD if answered >= self._why_asked else WHY_WAIT
@@ -252,7 +252,7 @@ class Housekeeping:
     def has_reasons(self, now: float) -> bool:
         """Return whether the autopilot has answered which reasons prevent arming."""
         return WHY_WAIT <= now - self._reasons_since < math.inf and (
-            now - self._link.questions.answered(REASONS) <= 2.0 * WHY_PERIOD)
+            now - self._link.questions.answer_time(REASONS) <= 2.0 * WHY_PERIOD)
 
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
@@ -264,9 +264,9 @@ class Housekeeping:
             needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
                     *filter(None, (dialect.minimum_takeoff, switch))])
 
-    def unreceived(self, now: float) -> str:
+    def unreceived_reason(self, now: float) -> str:
         """Return why the autopilot does not receive our messages, or ''."""
-        if not self._link.questions.unanswered(now):
+        if not self._link.questions.is_unanswered(now):
             return ''  # also of one that signs: USB needs no signature
         return NO_ANSWER if self._link.signing or not self._link.autopilot_signs else UNSIGNED
 

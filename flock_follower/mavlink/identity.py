@@ -215,7 +215,7 @@ class Identity:
             if now - sources.found <= FINDING]
         return f'{TWO_VEHICLES}, by their {" and ".join(evidence)}: {_REMEDY}' if evidence else ''
 
-    def same(self, before: Any, peer: Any) -> bool:
+    def is_same(self, before: Any, peer: Any) -> bool:
         """Return whether a vehicle is known to have changed only its address, as by a router."""
         old, new = self._peers.get(before), self._peers.get(peer)
         if old is None or new is None or not old.boots or not new.boots:

@@ -323,7 +323,7 @@ class Link:
         if kind != 'HEARTBEAT':
             return 'before HEARTBEAT'
         if math.isfinite(self.telemetry.message_time) and (
-                not self.identity.same(self.transport.peer, peer)):
+                not self.identity.is_same(self.transport.peer, peer)):
             self.peer_changes += 1
             self.telemetry.forget()
         self.transport.peer = peer

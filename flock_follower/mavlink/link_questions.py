@@ -66,7 +66,7 @@ class Question:
         """Take an answer at ``now``."""
         self.tries, self.since, self.answered = 0, math.inf, now
 
-    def ignored(self, now: float) -> bool:
+    def is_ignored(self, now: float) -> bool:
         """Return whether it was asked often enough, and for long enough, without an answer."""
         return self.tries >= TRIES and now - self.since >= PATIENCE
 
@@ -107,7 +107,7 @@ class LinkQuestions:
             name = TIMESYNC if message.tc1 and message.ts1 in self._times else ''
         elif kind in ('PARAM_VALUE', 'PARAM_ERROR'):
             name = parameter(message.param_id)
-        elif kind == 'COMMAND_ACK' and self.addressed(message):
+        elif kind == 'COMMAND_ACK' and self.is_addressed(message):
             self._any.answer(now)
             # A rate that is refused is an answer, too; a refusal names no reasons.
             done = message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or (
@@ -119,7 +119,7 @@ class LinkQuestions:
                 self._any.answer(now)
             self._questions[name].answer(now)
 
-    def answered(self, name: str) -> float:
+    def answer_time(self, name: str) -> float:
         """Return the time of the newest answer to a question, s; minus infinity: none."""
         question = self._questions.get(name)
         return -math.inf if question is None else question.answered
@@ -128,11 +128,11 @@ class LinkQuestions:
         """Return the questions that have no answer, or none any more."""
         # A copy: diagnostics read them from another thread.
         return [name for name, question in self._questions.copy().items()
-                if question.tries and (math.isinf(question.answered) or question.ignored(now))]
+                if question.tries and (math.isinf(question.answered) or question.is_ignored(now))]
 
-    def unanswered(self, now: float) -> bool:
+    def is_unanswered(self, now: float) -> bool:
         """Return whether the autopilot answers nothing."""
-        return self._any.ignored(now)
+        return self._any.is_ignored(now)
 
     def _asks(self, message: Any) -> list[str]:
         """Return the questions in a message of ours."""
@@ -152,7 +152,7 @@ class LinkQuestions:
         requested = _MESSAGES.get(int(message.param1), '')
         return [*filter(None, (name if name == RATES else '', requested))] or [name]
 
-    def addressed(self, ack: Any) -> bool:
+    def is_addressed(self, ack: Any) -> bool:
         """Return whether a COMMAND_ACK is to us; MAVLink 1 has no target (0)."""
         return all(target in (0, own) for target, own in zip(
             (ack.target_system, ack.target_component), self._source))

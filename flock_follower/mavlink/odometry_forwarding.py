@@ -92,7 +92,7 @@ class OdometryForwarder:
         if plausible_velocity(state.velocity) is None:
             return 'not plausible, not forwarded'
         last, self._last = self._last, (state, time)
-        if last is not None and jumped(*last, state, time):
+        if last is not None and has_jumped(*last, state, time):
             self.reset_counter = (self.reset_counter + 1) % 256
             self.counters['jumps'] += 1
         if last is not None and time < last[1]:
@@ -131,7 +131,7 @@ class OdometryForwarder:
         return now - self._sent
 
 
-def jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
+def has_jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
     """
     Return whether a pose differs from the one predicted from time ``then``, s, or time fell.
 
@@ -178,13 +178,13 @@ def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_c
     position_std, attitude_std, velocity_std, rate_std = ODOMETRY_STD
     x, y, z, w = quaternion_enu_flu_to_ned_frd(state.quaternion).tolist()
     # The covariance of R x is R C R^T.
-    pose_covariance = _transformed(
+    pose_covariance = _transform(
         _valid(state.pose_covariance, [position_std] * 3 + [attitude_std] * 3), _R_NED_ENU)
     twist_covariance: Array = np.zeros((6, 6))
     twist_covariance[:3, :3] = (
         R_enu_flu.T @ _valid(state.velocity_covariance, [velocity_std] * 3) @ R_enu_flu)
     twist_covariance[3:, 3:] = _valid(state.twist_covariance[3:, 3:], [rate_std] * 3)
-    twist_covariance = _transformed(twist_covariance, _R_FRD_FLU)
+    twist_covariance = _transform(twist_covariance, _R_FRD_FLU)
     return mavlink.MAVLink_odometry_message(
         max(0, round(time * 1e6)), dialect.odometry_frame, mavlink.MAV_FRAME_BODY_FRD,
         *enu_to_ned(state.position).tolist(), [w, x, y, z],
@@ -204,6 +204,6 @@ def _is_known(covariance: Array) -> bool:
     return bool(np.all(np.abs(covariance) < SANE) and np.all(np.diag(covariance) > 0.0))
 
 
-def _transformed(covariance: Array, rotation: Array) -> Array:
+def _transform(covariance: Array, rotation: Array) -> Array:
     both = np.kron(np.eye(2), rotation)
     return both @ covariance @ both.T

@@ -214,21 +214,21 @@ class ParameterCheck:
         self._patient = now - self._begun < PATIENCE
         due = [name for name in self._names(self.version) if self._open(name)
                and now - self._asked.get(name, -math.inf) >= RETRY_PERIOD]
-        due += [name for name in self.watched()
+        due += [name for name in self.watched_names()
                 if now - self._asked.get(name, -math.inf) >= WATCH_PERIOD]
         for name in due[:1]:
             self._asked[name] = now
             self._tries[name] = self._tries.get(name, 0) + 1
         return ''.join(due[:1])
 
-    def watched(self) -> list[str]:
+    def watched_names(self) -> list[str]:
         """Return the names that were answered and that a rule depends on: to read repeatedly."""
         if self._dialect is None:
             return []
         kept = {*self._dialect.watched, *(rule.name for rule in self._dialect.rules)}
         return [name for name in self.values if name in kept]
 
-    def known(self, name: str) -> bool:
+    def is_known(self, name: str) -> bool:
         """Return whether a value was answered, and no longer ago than some requests."""
         return name in self.values and self._tries.get(name, 0) <= UNKNOWN_AFTER
 
@@ -315,5 +315,5 @@ def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> 
         return (f'{", ".join(missing)} {"does" if len(missing) == 1 else "do"} not exist in '
                 f'{parameters.firmware}: {doubt}; its rules are known for '
                 f'{dialect.known_versions}')
-    unread = ', '.join(rule.name for rule in applicable if not parameters.known(rule.name))
+    unread = ', '.join(rule.name for rule in applicable if not parameters.is_known(rule.name))
     return unread and f'{unread} could not be read: {doubt}; {ASK}'

@@ -35,7 +35,7 @@ from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.mavlink import commands, parameter_check
 from flock_follower.mavlink.commands import Goal, NOT_RECEIVED, Request, Vehicle
 from flock_follower.mavlink.dialects import Dialect, PX4
-from flock_follower.mavlink.estimator_health import explained, misplaced
+from flock_follower.mavlink.estimator_health import explain_refusal, find_misplacement
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.identity import not_hovering
 from flock_follower.mavlink.link import Link
@@ -121,7 +121,7 @@ class Requests:
 
     def acknowledge(self, ack: Any, now: float) -> None:
         """Take a COMMAND_ACK."""
-        ours = self._link.questions.addressed(ack)  # not to a ground station
+        ours = self._link.questions.is_addressed(ack)  # not to a ground station
         if ours and self.newest is not None and self.newest.acknowledge(
                 ack.command, ack.result, now):
             self._housekeeping.request_reasons()
@@ -173,7 +173,7 @@ class Requests:
             return
         self._ask(request, streaming_for, now)
         if request.outcome is not None and not request.outcome.success:
-            request.outcome = request.outcome._replace(message=explained(
+            request.outcome = request.outcome._replace(message=explain_refusal(
                 request.outcome.message, self._link.telemetry.estimator, now))
             if offboard:
                 self._gate.permit(permission.fail(request.outcome.message))
@@ -183,7 +183,7 @@ class Requests:
         if status is not None:
             vehicle = Vehicle(status, telemetry.altitude(now),
                               telemetry.shown_time(request.current.command),
-                              telemetry.flying(now) is not False)
+                              telemetry.is_flying(now) is not False)
         elif request.own:
             return  # The pilot may have switched modes: to repeat it would take the vehicle back.
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self._texts,
@@ -208,18 +208,18 @@ class Requests:
         dialect = telemetry.dialect
         if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
-        reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived(now),
+        reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived_reason(now),
                    gate.permission.taken_over(now),
                    gate.contradiction(now),
                    not_hovering(telemetry.vehicle_type, telemetry.vtol_state(now))]
         if gate.speed(now) is None:
             reasons.append('no velocity known: neither odom nor LOCAL_POSITION_NED')
         if in_air:
-            reasons += [IN_AIR[telemetry.flying(now)],
+            reasons += [IN_AIR[telemetry.is_flying(now)],
                         envelope.refuse_height(gate.limits, gate.heights.height(now))]
         reasons += [self._housekeeping.watch.obstacle(), self._end.battery_low(now),
                     self._housekeeping.origin.obstacle,
-                    misplaced(telemetry.local_place(now), telemetry.home(),
+                    find_misplacement(telemetry.local_place(now), telemetry.home(),
                               gate.odometry_position)]
         if self._require_failsafe:
             reasons.append(parameter_check.obstacle(
@@ -234,7 +234,7 @@ class Requests:
         if not status.armed:
             return 'disarmed: arm first'
         # A second climb would begin at the height that the first has reached by now.
-        if telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
+        if telemetry.is_flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
             return 'already in the air'
         if telemetry.altitude(now) is None:
             return 'no LOCAL_POSITION_NED: the height reached would be unknown'

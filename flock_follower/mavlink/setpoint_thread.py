@@ -120,9 +120,9 @@ class SetpointThread:
                 next_cycle = self._turn(next_cycle)
             self._bridge.stop(time.monotonic())
             end = time.monotonic() + EXIT_TIMEOUT
-            while not self._bridge.stopped(time.monotonic()) and time.monotonic() < end:
+            while not self._bridge.has_stopped(time.monotonic()) and time.monotonic() < end:
                 next_cycle = self._turn(next_cycle)
-            self._guarded(lambda: self._bridge.finish(time.monotonic()))
+            self._guard(lambda: self._bridge.finish(time.monotonic()))
         finally:
             self._ended.set()
             self._refuse_submitted()
@@ -130,15 +130,15 @@ class SetpointThread:
     def _turn(self, next_cycle: float) -> float:
         """Listen until the next cycle is due, run it, and return when the one after is."""
         wait = 0.0 if self._submitted else max(0.0, next_cycle - time.monotonic())
-        if not self._guarded(lambda: self._listen(wait)):
+        if not self._guard(lambda: self._listen(wait)):
             # Otherwise listening that fails at once would be repeated without a pause.
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
         # Of a flood only so many actions that the cycle is not delayed.
         if count := min(len(self._submitted), MOST_AT_ONCE):
             for _ in range(count):
-                self._guarded(self._submitted.popleft()[0])
+                self._guard(self._submitted.popleft()[0])
             # One of them may have brought odometry to forward.
-            self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
+            self._guard(lambda: self._bridge.send_odometry(time.monotonic()))
         now = time.monotonic()
         if self._bridge.gate.commands.is_new:
             next_cycle = min(next_cycle, max(now, self._last_cycle + SHORTEST_PERIOD))
@@ -148,13 +148,13 @@ class SetpointThread:
         next_cycle += self._period
         if next_cycle < now:  # more than a period late
             next_cycle = now + self._period
-        cycle = self._guarded(lambda: self._bridge.cycle(now))
+        cycle = self._guard(lambda: self._bridge.cycle(now))
         if cycle is not None and not self._quit.is_set():
             # Read the clock again: deciding, packing and writing took time.
-            self._guarded(lambda: self._on_cycle(cycle, time.monotonic()))
+            self._guard(lambda: self._on_cycle(cycle, time.monotonic()))
         return next_cycle
 
-    def _guarded(self, action: Callable[[], T]) -> T | None:
+    def _guard(self, action: Callable[[], T]) -> T | None:
         """Run an action; return its result, or None if it raised, which is reported."""
         try:
             return action()
@@ -165,7 +165,7 @@ class SetpointThread:
     def _refuse_submitted(self) -> None:
         with contextlib.suppress(IndexError):  # two threads may do so at once
             while True:
-                self._guarded(self._submitted.popleft()[1])
+                self._guard(self._submitted.popleft()[1])
 
     def _listen(self, wait: float) -> bool:
         """Receive for at most ``wait``, s; return True."""

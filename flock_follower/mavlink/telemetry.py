@@ -215,7 +215,7 @@ class Telemetry:
         known = self.alive(now, link_timeout) and self.mode_age(now) <= MODE_TIMEOUT
         return self.status if known else None
 
-    def flying(self, now: float) -> bool | None:
+    def is_flying(self, now: float) -> bool | None:
         """Return whether the vehicle reports that it is in the air; None without a report."""
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
         return None if message is None else _FLYING.get(message.landed_state)

@@ -132,11 +132,11 @@ class _Line:
             self._waiting = self._waiting[taken or 0:]
         return bool(self._waiting)
 
-    def congested(self) -> bool:
+    def is_congested(self) -> bool:
         """Return whether waiting data would delay a setpoint."""
-        return self._waits() or self._queued() > self._backlog
+        return self._waits() or self._queued_bytes() > self._backlog
 
-    def _queued(self) -> int:
+    def _queued_bytes(self) -> int:
         """Return how many bytes the kernel keeps: not sent yet, or over TCP not acknowledged."""
         try:
             return int(struct.unpack('i', fcntl.ioctl(self._fd, termios.TIOCOUTQ, b'\0' * 4))[0])
@@ -301,7 +301,7 @@ class UdpTransport(_Line):
 #: reason why no data can pass now (unplugged, refused), or ''. ``capacity`` is in bytes per second
 #: each way, 0 if it does not matter. ``delivers_late`` is whether data that cannot arrive now is
 #: kept. ``fileno`` is -1 without a descriptor to select on. ``reopen`` tries to open a lost port,
-#: at most every RETRY_PERIOD. ``congested`` is whether waiting data would delay a setpoint.
+#: at most every RETRY_PERIOD. ``is_congested`` is whether waiting data would delay a setpoint.
 Transport = UdpTransport | SerialTransport | TcpTransport
 
 

@@ -45,7 +45,7 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
     flight.bridge.stop(start)
     # Nothing lets it follow again.
     assert not flight.bridge.requests.offboard(True, start).outcome.success
-    while not flight.bridge.stopped(flight.now):
+    while not flight.bridge.has_stopped(flight.now):
         flight.fly(0.05)
         assert flight.kinds(1) == {'brake'}
     assert 0.2 < flight.now - start <= 1.0
@@ -66,7 +66,7 @@ def test_a_pilot_who_has_taken_over_is_left_alone_at_the_end_of_the_bridge(perso
     flight.bridge.stop(flight.now)
     flight.wire.written = []
     flight.bridge.finish(flight.now)
-    assert flight.bridge.stopped(flight.now) and flight.wire.written == []
+    assert flight.bridge.has_stopped(flight.now) and flight.wire.written == []
 
 
 @BOTH
@@ -77,7 +77,7 @@ def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_show
     while flight.mode != flight.modes.land:
         flight.fly(0.01)
     flight.bridge.stop(flight.now)
-    assert flight.bridge.gate.flies and flight.bridge.stopped(flight.now)
+    assert flight.bridge.gate.flies and flight.bridge.has_stopped(flight.now)
     flight.bridge.finish(flight.now)
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(1.0)

@@ -95,7 +95,7 @@ def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(per
 def test_on_a_congested_line_setpoints_are_sent_and_odometry_is_not():
     flight = forwarding(Flight(**without_gps('px4')))
     flight.engage()
-    flight.wire.congested, start = lambda: True, flight.now
+    flight.wire.is_congested, start = lambda: True, flight.now
     flight.fly(0.4)
     assert len(flight.setpoints(start)) == 8
     assert not [m for t, m in flight.received if m.get_type() == 'ODOMETRY' and t > start]

@@ -129,7 +129,7 @@ def test_a_third_autopilot_is_one_record(monkeypatch):
         0, mavlink.ESTIMATOR_ATTITUDE, 0, 0, 0, 0, 0, 0, 0, 0))
     assert bridge.telemetry.dialect is third
     assert bridge.gate.autopilot.hover_thrust == 'THIRD_HOVER'
-    assert bridge.distrusted(now) == 'is invalid according to its estimator'
+    assert bridge.velocity_fault(now) == 'is invalid according to its estimator'
     asked = [mavlink.MAVLink(None).decode(bytearray(data)) for data in line.written]
     assert 'THIRD_LOSS' in [m.param_id for m in asked if m.get_type() == 'PARAM_REQUEST_READ']
     cycle(mavlink.MAVLink_param_value_message(

@@ -22,13 +22,13 @@ import pytest
 
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.estimator_health import (
-    distrusted,
     estimator_status,
     EstimatorStatus,
-    explained,
+    explain_refusal,
+    find_misplacement,
     gps_fix,
     GpsFix,
-    misplaced,
+    velocity_fault,
 )
 
 # What PX4 1.16 sent while vision was fused in flight, then 0.6 s and 5 s after it was lost.
@@ -70,10 +70,10 @@ def test_the_flags_that_an_estimator_lacks_are_named_as_mavlink_names_them(
         dialect, flags, missing):
     status = estimator_status(MESSAGES[dialect.name](flags), dialect, 5.0)
     assert status.missing == missing
-    assert explained('arm refused', status, 5.0) == (
+    assert explain_refusal('arm refused', status, 5.0) == (
         f'arm refused; its estimator lacks {", ".join(missing)}' if missing else 'arm refused')
-    assert explained('arm refused', status, 8.1) == explained('arm refused', None, 5.0) == (
-        'arm refused')
+    assert explain_refusal('arm refused', status, 8.1) == 'arm refused'
+    assert explain_refusal('arm refused', None, 5.0) == 'arm refused'
 
 
 def fixes(*types):
@@ -107,7 +107,7 @@ LOST = fixes(1, 6, 1, 1)
     (GOOD._replace(time=16.0), LOST, math.inf, 16.1, '')])
 def test_it_is_distrusted_from_what_it_rests_on_and_from_what_the_estimator_says(
         status, gps, forwarded, now, why):
-    assert distrusted(status, gps, forwarded, now) == why
+    assert velocity_fault(status, gps, forwarded, now) == why
 
 
 def test_a_fix_is_lost_since_the_first_message_without_it():
@@ -123,6 +123,6 @@ def test_a_fix_is_lost_since_the_first_message_without_it():
     ((-1067128.1, -5227320.5, 489.7), None, None, 'steps of 0.5 m'),
     ((math.nan, 0, 0), None, None, 'steps of 0.5 m')])
 def test_an_estimate_in_another_place_is_found(position, home, odometry, reason):
-    found = misplaced(*(None if each is None else np.array(each, dtype=float)
+    found = find_misplacement(*(None if each is None else np.array(each, dtype=float)
                         for each in (position, home, odometry)))
     assert (reason in found) and bool(found) == bool(reason)

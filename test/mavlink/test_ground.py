@@ -30,7 +30,7 @@ OURS = VehicleStatus(True, 'OFFBOARD', True)
 
 def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
     flight = Flight().follow(1.0)
-    monkeypatch.setattr(flight.bridge.telemetry, 'flying', lambda now: False)
+    monkeypatch.setattr(flight.bridge.telemetry, 'is_flying', lambda now: False)
     flight.fly(2.5)
     assert flight.bridge.state(flight.now) == 'ACTIVE' and flight.kinds(40) == {'command'}
 

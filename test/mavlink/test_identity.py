@@ -56,7 +56,7 @@ def test_all_that_is_sent_bears_the_system_id_of_its_vehicle_unless_one_is_set(t
                  lambda: bench.link.send_command(mavlink.MAV_CMD_DO_SET_MODE, (1.0,))):
         assert send() and bench.written().get_srcSystem() == own
     ours = mavlink.MAVLink_command_ack_message(1, 0, 0, 0, own, 191)
-    assert bench.link.questions.addressed(ours) == bench.link.questions.addressed(
+    assert bench.link.questions.is_addressed(ours) == bench.link.questions.is_addressed(
         mavlink.MAVLink_command_ack_message(1, 0)) is True
 
 

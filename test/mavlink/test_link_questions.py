@@ -79,7 +79,7 @@ def test_every_question_is_unknown_until_its_own_answer_arrives(answered):
         for message in (*NO_ANSWERS, *(QUESTIONS[name][1] for name in answered)):
             questions.take(message, second + 0.1)
     assert {*questions.unknown(3.2)} == QUESTIONS.keys() - answered
-    assert questions.unanswered(3.2) == (answered <= UNASKED)
+    assert questions.is_unanswered(3.2) == (answered <= UNASKED)
 
 
 @pytest.mark.parametrize('name', QUESTIONS)
@@ -91,9 +91,9 @@ def test_an_answer_grows_old_after_three_seconds_and_three_tries(name):
         if time < 2.0:
             questions.sent(question, time)
         assert questions.unknown(time) == unknown
-        assert name in UNASKED or questions.unanswered(time) == bool(unknown)
+        assert name in UNASKED or questions.is_unanswered(time) == bool(unknown)
     questions.pause()  # the link was lost: they count anew
-    assert questions.unknown(9.0) == [] and not questions.unanswered(9.0)
+    assert questions.unknown(9.0) == [] and not questions.is_unanswered(9.0)
     questions.begin_again()
     questions.sent(question, 9.0)
     assert questions.unknown(9.0) == [name]
@@ -116,14 +116,14 @@ def test_a_line_on_which_nothing_arrives_at_the_autopilot_is_named_and_refuses_o
     assert flight.bridge.unready(flight.now) is None
     flight.autopilot.faults.clear()
     flight.bridge.link.autopilot_signs = True
-    assert flight.bridge.housekeeping.unreceived(flight.now) == UNSIGNED
+    assert flight.bridge.housekeeping.unreceived_reason(flight.now) == UNSIGNED
 
 
 def test_a_line_that_breaks_in_flight_stops_no_flight():
     flight = Flight(faults=[Fault('drop', 6.0, direction='received', message=message) for message
                             in ('TIMESYNC', 'PARAM_REQUEST_READ', 'COMMAND_LONG')])
     flight.follow(9.0)
-    assert flight.bridge.housekeeping.unreceived(flight.now) == NO_ANSWER
+    assert flight.bridge.housekeeping.unreceived_reason(flight.now) == NO_ANSWER
     assert flight.bridge.state(flight.now) == 'ACTIVE' and flight.kinds(40) == {'command'}
 
 
@@ -141,7 +141,7 @@ def test_a_flight_whose_answers_to_one_question_are_lost_knows_the_others(
         Fault('drop', 0.0, direction='sent', message=dropped)])
     flight.fly(3.5)
     assert {*flight.bridge.link.questions.unknown(flight.now)} == unknown
-    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
+    assert flight.bridge.housekeeping.unreceived_reason(flight.now) == ''
     assert (flight.bridge.unready(flight.now) is None) == (dropped == 'COMMAND_ACK')
     if dropped == 'PARAM_VALUE':
         refusal = flight.bridge.refusal(flight.now)

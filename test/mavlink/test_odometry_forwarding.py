@@ -26,7 +26,7 @@ from flock_follower.geometry import (
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
-    jumped,
+    has_jumped,
     OdometryForwarder,
     OLDEST_FORWARDED,
     quality,
@@ -96,7 +96,7 @@ def test_a_covariance_that_is_none_is_replaced(bad):
     ({'time': 10.5, 'position': (1.2, 2.0, 3.0)}, False),
     ({'time': 11.0, 'position': (1.0, 2.0, 3.0)}, True)])
 def test_a_jump_is_what_the_motion_does_not_explain(change, jump):
-    assert jumped(*sample(), *sample(**{'time': 10.1, **change})) == jump
+    assert has_jumped(*sample(), *sample(**{'time': 10.1, **change})) == jump
 
 
 def test_jumps_raise_the_reset_counter_of_every_message_after():

@@ -72,7 +72,7 @@ class Bridge:
             raise RuntimeError('broken')
         return 'a cycle'
 
-    def stopped(self, now):
+    def has_stopped(self, now):
         return True
 
 

@@ -124,8 +124,8 @@ def test_an_autopilot_whose_clock_falls_back_has_rebooted(stamps):
     (mavlink.MAV_LANDED_STATE_LANDING, True)])
 def test_the_vehicle_says_whether_it_flies(state, flying):
     telemetry = received(mavlink.MAVLink_extended_sys_state_message(0, state))
-    assert telemetry.flying(3.9) is flying
-    assert telemetry.flying(4.1) is None and Telemetry().flying(0.0) is None  # told at 5 Hz
+    assert telemetry.is_flying(3.9) is flying
+    assert telemetry.is_flying(4.1) is None and Telemetry().is_flying(0.0) is None  # told at 5 Hz
 
 
 def test_heights_are_known_above_the_sea_and_the_local_origin():

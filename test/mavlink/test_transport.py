@@ -78,7 +78,7 @@ def test_a_serial_device_that_is_away_is_reported_and_opened_when_it_comes(termi
     for lost_at in (1.0, 10.0):
         assert (transport.fileno(), transport.fault) == (-1, MISSING)
         assert not transport.write(b'lost') and list(transport.read()) == []
-        assert not transport.congested()
+        assert not transport.is_congested()
         transport.reopen(lost_at)
         main, replica = plug()
         transport.reopen(lost_at + 0.9 * RETRY_PERIOD)
@@ -102,9 +102,9 @@ def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(termi
     received = b''
     while len(received) < sent * len(message):
         received += os.read(main, 65536)
-        transport.congested()  # which sends what waits
+        transport.is_congested()  # which sends what waits
     assert received == sent * message
-    assert not transport.congested() and transport.write(b'x')
+    assert not transport.is_congested() and transport.write(b'x')
 
 
 def test_a_port_is_8n1_without_flow_control_however_it_was_left(terminal):
@@ -150,12 +150,12 @@ def test_tcp_connects_when_somebody_listens_again_after_a_close_and_holds_odomet
         transport.reopen(now)
         peer, _ = server.accept()
         carries(transport, peer.fileno())
-        assert not transport.congested()
+        assert not transport.is_congested()
         peer.close()
         assert wait(transport) == b'' and transport.fault == 'closed by the other end'
     transport.reopen(3.0)
     peer, _ = server.accept()
-    while not transport.congested():  # nobody reads
+    while not transport.is_congested():  # nobody reads
         assert transport.write(bytes(70))
     assert transport.write(bytes(70))  # there is room for setpoints
     for end in (transport, peer, server):

@@ -120,7 +120,7 @@ class Bench(Driven):
         self.beat()
         self.send(mavlink.MAVLink_extended_sys_state_message(
             0, mavlink.MAV_LANDED_STATE_IN_AIR))
-        self.wait(lambda: self.bridge.telemetry.flying(time.monotonic()))
+        self.wait(lambda: self.bridge.telemetry.is_flying(time.monotonic()))
         gate = self.bridge.gate
         self.node._stream.submit(lambda: gate.permit(gate.permission.request(time.monotonic())))
         self.wait(lambda: gate.permission.streams)

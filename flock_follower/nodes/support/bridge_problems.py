@@ -95,9 +95,9 @@ class BridgeProblems:
     def _vehicle_values(self, now: float) -> dict[str, object]:
         """Return the state of autopilot and flight, and reasons against offboard and arming."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
-        status, flying, unready = bridge.status(now), telemetry.flying(now), bridge.unready(now)
+        status, flying, unready = bridge.status(now), telemetry.is_flying(now), bridge.unready(now)
         result, unreceived = (
-            bridge.housekeeping.parameters.result(), bridge.housekeeping.unreceived(now))
+            bridge.housekeeping.parameters.result(), bridge.housekeeping.unreceived_reason(now))
         values: dict[str, object] = {
             'link': ('one way' if unreceived else 'alive') if bridge.alive(now) else (
                 'lost' if telemetry.status else 'never received'),
@@ -168,8 +168,9 @@ class BridgeProblems:
             if transport.fault:
                 return f'cannot send on {transport.url}: {transport.fault}'
             age = telemetry.mode_age(now)
-            return self._bridge.housekeeping.unreceived(now) or ('' if age <= MODE_TIMEOUT else (
-                f'mode unknown: neither HEARTBEAT nor CURRENT_MODE for {age:.1f} s'))
+            return self._bridge.housekeeping.unreceived_reason(now) or (
+                '' if age <= MODE_TIMEOUT else
+                f'mode unknown: neither HEARTBEAT nor CURRENT_MODE for {age:.1f} s')
         received = telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
@@ -187,8 +188,8 @@ class BridgeProblems:
                    if newest is None or now - newest.time > REPORTED_SILENCE]
         if missing:
             return f'the autopilot sends no {" and no ".join(missing)}: is its estimator ready?'
-        distrusted = self._bridge.distrusted(now)
-        return distrusted and estimator_health.explained(
+        distrusted = self._bridge.velocity_fault(now)
+        return distrusted and estimator_health.explain_refusal(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
 
     def _end_requests(self, now: float) -> str:
@@ -268,7 +269,7 @@ class BridgeProblems:
             return False
         requested = newest is not None and newest.goal.command == TAKEOFF and (
             newest.outcome is None or newest.outcome.success)
-        return requested or telemetry.flying(now) is False
+        return requested or telemetry.is_flying(now) is False
 
     def _publisher_problem(self, now: float) -> Problem | None:
         permission = self._bridge.gate.permission

@@ -111,7 +111,7 @@ class BridgeReport:
             telemetry.local_position, telemetry.attitude, telemetry.battery)
         if position is not None and position.time == now and attitude is not None:
             age = bridge.housekeeping.timesync.age(position.time_boot_ms, to_nanoseconds(now))
-            if distrusted := bridge.distrusted(now):
+            if distrusted := bridge.velocity_fault(now):
                 self.refused('mavlink/odom not published', f'its velocity {distrusted}')
             elif known := estimate(position, attitude, age):
                 self._send_estimate(*known)
