@@ -194,11 +194,11 @@ class Sharing:
                 sender.ban = received + BAN_TIME, 'has a clock that is ahead'
             self._refuse(*refused)
         elif not self._refuse_first((sender is None and len(self._senders) >= MAX_SENDERS,
-                                'too many senders', name)):
+                                     'too many senders', name)):
             sender = self._senders.setdefault(name, Sender(name))
             sender.received = received
             if not self._refuse_first((received < sender.ban[0], 'ignored for a while',
-                                  f'{name} {sender.ban[1]}')):
+                                       f'{name} {sender.ban[1]}')):
                 self._take_from(sender, state, received)
 
     def _take_from(self, sender: Sender, state: OdometryState, received: int) -> None:

@@ -178,7 +178,7 @@ def stop(along: Sequence[float], left: float, velocity: Sequence[float],
     guarding, rate = params.guarding, scalar_product(along, velocity)
     # Until the command acts the vehicle keeps its velocity.
     speed, slope = guarding.closing_speed(left - max(rate, 0.0) * params.response_time,
-                                    max(guarding.b, STOP_SHARE * params.strongest))
+                                          max(guarding.b, STOP_SHARE * params.strongest))
     return Bound(
         opposite(along), (rate - max(speed, 0.0)) / guarding.T_g + slope * max(rate, 0.0), FENCE)
 

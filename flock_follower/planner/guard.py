@@ -305,7 +305,7 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
         if here or not (name in memory.ranged or (scene.blinded and not n.received)):
             near += _neighbor_bounds(n, memory, scene, moving, here, params)
     return sort_bounds(near, fences(memory.lost, me.position, velocity, params),
-                   _sight_bounds(memory, scene, moving, view, params))
+                       _sight_bounds(memory, scene, moving, view, params))
 
 
 def _is_covered(it: Prediction, scene: Scene) -> bool:
@@ -347,7 +347,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
                           joined and place is places[-1], params, radii_sum, headway)
     if memory.lost is not None and not (seen or n.received):
         found = [limit_to_retreat(each, memory.lost, me.position, velocity, params,
-                            n.name == memory.lost.name) for each in found]
+                                  n.name == memory.lost.name) for each in found]
     if has_failed:
         found += [each._replace(normal=_pass_beside(each.normal)) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
@@ -361,7 +361,7 @@ def _hover_place(n: Neighbor, params: PlannerParams) -> Prediction:
         STOP_SHARE * params.strongest) * along
     variance = float(n.position_covariance.trace())
     return Prediction((n.position + stops).tolist(), [*ZERO_VECTOR], [*ZERO_VECTOR],
-                    RECEIVED_SIGMAS * math.sqrt(max(variance, 0.0) / 3.0), 0.0, [*ZERO_VECTOR])
+                      RECEIVED_SIGMAS * math.sqrt(max(variance, 0.0) / 3.0), 0.0, [*ZERO_VECTOR])
 
 
 def _pass_beside(away: Sequence[float]) -> list[float]:

@@ -87,7 +87,7 @@ class Disturbance(NamedTuple):
     """(3,), m/s^2."""
 
     def update(self, velocity: Array, command: Array | None, elapsed: float,
-                 response_time: float) -> Disturbance:
+               response_time: float) -> Disturbance:
         """Return the estimate after a relative velocity (3,), m/s: a Luenberger observer."""
         if self.velocity is None or command is None:
             return self._replace(velocity=velocity)

@@ -127,7 +127,7 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
 
 
 def _predict(n: Neighbor, memory: Memory, me: OwnState,
-              params: PlannerParams) -> Prediction:
+             params: PlannerParams) -> Prediction:
     """Return the prediction of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
     it = predict(n, memory.acceleration(n), age, params)

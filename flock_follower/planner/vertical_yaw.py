@@ -80,7 +80,7 @@ class Altitude(NamedTuple):
                    max(ground + params.altitude_max - ALTITUDE_MARGIN, z))
 
     def follow(self, leader: Neighbor | None, params: PlannerParams,
-                  elapsed: float) -> Altitude:
+               elapsed: float) -> Altitude:
         """Return the altitude after ``elapsed`` s of following a neighbor."""
         if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
@@ -107,8 +107,8 @@ class Altitude(NamedTuple):
         return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
 
     def control(self, me: OwnState, params: PlannerParams, least: float = -math.inf,
-                   most: float = math.inf, coming: float = 0.0, raised: float = -math.inf
-                   ) -> tuple[Altitude, float]:
+                most: float = math.inf, coming: float = 0.0, raised: float = -math.inf
+                ) -> tuple[Altitude, float]:
         """
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 

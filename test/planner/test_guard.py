@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -102,6 +102,7 @@ def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, cou
 
 
 @given(SEED)
+@example(3243)  # the bounds contradict each other: separation comes first
 def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_max(
         seed: int) -> None:
     a, v, _ = situation(seed, 0)
