@@ -47,9 +47,12 @@ from flock_follower.perception.tracker import Sighting, Tracker
 from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseState
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
-WAITS = 50  # images over which the wait for odometry is observed
-LONGER = 1.5  # times the longest of these waits, and
-MARGIN = 0.03  # s more: odometry is late by now
+#: Images over which the wait for odometry is observed.
+N_WAITS = 50
+#: Odometry is late after this factor times the longest observed wait, plus LATE_MARGIN.
+LATE_FACTOR = 1.5
+#: Odometry is late after LATE_FACTOR times the longest observed wait, plus this, s.
+LATE_MARGIN = 0.03
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -118,7 +121,7 @@ class Perceiver:
         self.frame = ''
         self._choice = OdometryChoice()
         self._max_wait = max_wait
-        self._waits: deque[float] = deque(maxlen=WAITS)  # of images that odometry reached, s
+        self._waits: deque[float] = deque(maxlen=N_WAITS)  # of images that odometry reached, s
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self.sources = PoseSources(tracker, max_wait)
         self._epoch: int | None = None
@@ -132,9 +135,9 @@ class Perceiver:
     @property
     def _wait(self) -> float:
         """Return how long an image waits for odometry now, s."""
-        if len(self._waits) < WAITS:
+        if len(self._waits) < N_WAITS:
             return self._max_wait
-        return min(LONGER * max(self._waits) + MARGIN, self._max_wait)
+        return min(LATE_FACTOR * max(self._waits) + LATE_MARGIN, self._max_wait)
 
     def model(self, camera: str = '') -> CameraModel | None:
         """Return the calibration of a camera; None before a usable one."""
@@ -220,7 +223,7 @@ class Perceiver:
         :param clock: measures the time spent, s.
         :param shown: returns of a camera's name whether its images are decoded in any case.
         """
-        ready = next((each for each in self._pending if self._ready(each, now)), None)
+        ready = next((each for each in self._pending if self._is_ready(each, now)), None)
         if ready is None:
             return None
         self._pending = [each for each in self._pending if each is not ready]
@@ -240,7 +243,7 @@ class Perceiver:
             sighting.rejections.append((INVALID_IMAGE, str(error)))
         return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
 
-    def _ready(self, image: PendingImage, now: float) -> bool:
+    def _is_ready(self, image: PendingImage, now: float) -> bool:
         """Return whether to process an image now: it waits for calibration and odometry."""
         waited = now - image.received
         reached = self._cameras[image.camera].model is not None and self.tracker.missing(

@@ -29,10 +29,10 @@ from flock_follower.odometry.buffer import Missing
 from flock_follower.perception.pending_images import (
     INVALID_IMAGE,
     MOST_PENDING,
+    N_WAITS,
     NO_CAMERA,
     Perceiver,
     Processed,
-    WAITS,
 )
 from flock_follower.perception.tracker import camera_mounting, Tracker
 
@@ -101,7 +101,7 @@ def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time()
 
 def test_images_wait_little_longer_than_odometry_was_late_of_late() -> None:
     queue = Queue()
-    for k in range(WAITS):
+    for k in range(N_WAITS):
         stamp = 0.01 * k
         queue.image(stamp, now=stamp)
         queue.odometry(stamp)
