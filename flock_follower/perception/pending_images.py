@@ -47,7 +47,8 @@ from flock_follower.perception.tracker import Sighting, Tracker
 from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseState
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
-LATE_FACTOR = 1.5  # longest wait for odometry, times that observed
+#: Odometry is late after this factor times the longest observed wait, plus a margin.
+LATE_FACTOR = 1.5
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -210,7 +211,7 @@ class Perceiver:
         :param clock: measures the time spent, s.
         :param shown: returns of a camera's name whether its images are decoded in any case.
         """
-        ready = next((each for each in self._pending if self._ready(each, now)), None)
+        ready = next((each for each in self._pending if self._is_ready(each, now)), None)
         if ready is None:
             return None
         self._pending = [each for each in self._pending if each is not ready]
@@ -230,7 +231,7 @@ class Perceiver:
             sighting.rejections.append((INVALID_IMAGE, str(error)))
         return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
 
-    def _ready(self, image: PendingImage, now: float) -> bool:
+    def _is_ready(self, image: PendingImage, now: float) -> bool:
         """Return whether to process an image now: it waits for calibration and odometry."""
         waited = now - image.received
         reached = self._cameras[image.camera].model is not None and self.tracker.missing(
