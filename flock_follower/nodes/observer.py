@@ -159,7 +159,11 @@ class Observer(Node):
         """Subscribe to the poses of other detectors, once the parameters have come."""
         if 'relative_pose' not in self.seen.parameters:
             return
-        for source in (n.source for n in self._neighbors().neighbors if n.source is not None):
+        try:
+            neighbors = self._neighbors().neighbors
+        except (OSError, ValueError):  # raised again, and reported, at the end
+            return
+        for source in (n.source for n in neighbors if n.source is not None):
             topic = full_name(source.topic, self.seen.namespace) if source.topic else ''
             msgtype = next((each for each in POSE_TYPES if each in published.get(topic, ())), '')
             if msgtype and topic not in self._subscribed:

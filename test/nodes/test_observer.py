@@ -16,14 +16,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
 
+from flock_follower.checks.collector import POSES
 from flock_follower.nodes.observer import DISCOVERY, Observer
 
 
@@ -36,4 +40,25 @@ def test_no_arrival_is_counted_before_the_clock_is_known(ros: None, monkeypatch:
         observer._take('odom', '/odom', serialize_message(Odometry()),
                        {'received_timestamp': time.time_ns()})
     assert observer.seen.topics['/odom'].arrivals == [100.0, 101.0]
+    observer.destroy_node()
+
+
+def test_poses_of_another_detector_are_taken_once_the_parameters_have_come(
+        ros: None, tmp_path: Path, monkeypatch: Any) -> None:
+    file = tmp_path / 'neighbors.yaml'
+    file.write_text('neighbors: [{name: leader, pose_topic: poses}]')
+    observer, now = Observer(1.0, '', {}, ''), time.monotonic()
+    published = {'/poses': ['geometry_msgs/msg/PoseStamped']}
+    observer._look_for_poses(published)
+    assert '/poses' not in [each.topic_name for each in observer.subscriptions]
+    observer.seen.parameters['relative_pose'] = {'neighbors_file': str(file)}
+    for _ in range(2):
+        observer._look_for_poses(published)
+    assert [each.topic_name for each in observer.subscriptions].count('/poses') == 1
+    monkeypatch.setattr(time, 'monotonic', lambda: now + DISCOVERY + 0.1)
+    observer._take(POSES, '/poses', PoseStamped(header=Header(stamp=Time(sec=100))),
+                   {'received_timestamp': 100_200_000_000})
+    observer._collector.finish(observer._neighbors())
+    assert observer.seen.topics['/poses'].stamps == [100.0]
+    assert observer.seen.sources['leader'].taken == 1
     observer.destroy_node()

@@ -27,7 +27,7 @@ from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_follower.bags.bag import deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
-from flock_follower.checks.findings import ERROR, OK
+from flock_follower.checks.findings import ERROR, OK, WARNING
 from flock_follower.checks.recorded_system import check_bag
 from flock_follower.flight_parameters import TABLE
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
@@ -157,3 +157,11 @@ def test_check_judges_the_topic_of_the_poses(tmp_path: Path) -> None:
         rows = {finding.what: finding for finding in findings}
         assert rows['poses of leader'].level == level
         assert 'images' not in rows and 'calibration' not in rows
+
+
+def test_check_names_latency_and_outliers_of_the_poses(tmp_path: Path) -> None:
+    bag = recorded(tmp_path, Faults(3, 0.2, 0.05, 0.15))
+    _, findings = check_bag(bag, values(tmp_path))
+    rows = {finding.what.removeprefix('poses of leader '): finding.level for finding in findings}
+    assert (rows['latency'], rows['outliers'], rows['used'], rows['axes'], rows['frames_topic']
+            ) == (WARNING, WARNING, OK, OK, OK)
