@@ -24,6 +24,7 @@
 #   make bench-evaluate  CPU time of evaluate beside reading and decoding the same bag (a minute)
 #   make bench-stack        CPU time of the three nodes in flight beside three that only pass messages (a minute; DURATION=600)
 #   make worst-case         search for the leader that brings the follower nearest to itself (an hour)
+#   make guard-campaign     fly the distances of the pages of guard and flocks, in lock step (hours)
 # Try to break it
 #   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
 #   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
@@ -79,7 +80,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless px4-events lint site figures flights \
-	bench-simulation bench-evaluate bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
+	bench-simulation bench-evaluate bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case guard-campaign fuzz kills mutation \
 	seeded-bugs frozen freeze bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
@@ -154,6 +155,9 @@ bench-markers: setup
 
 worst-case: setup
 	@$(RUN) benchmarks/worst_case.py
+
+guard-campaign: setup
+	@$(RUN) benchmarks/guard_campaign.py
 
 bench-planner: setup
 	@$(RUN) benchmarks/planner_tick.py
