@@ -44,38 +44,56 @@ from flock_follower.perception.edges import (
     solve_normal,
 )
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.print_model import DERIVATIVES, EdgeModel, median
+from flock_follower.perception.print_model import EdgeModel, median, N_DERIVATIVES
 
-#: px between samples of a profile: least, and most; but as a share of the cell more may be needed.
-SPACING = (0.3, 1.2)
-WIDEST = 0.1
-_HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
-_REACH = 2 * _HALF  # likewise of a profile
-_KERNEL_SIGMA = 2.0  # samples
+#: Least distance between samples of a profile, px.
+MIN_SPACING = 0.3
+#: Most distance between samples of a profile, px, unless MAX_SPACING_SHARE is more.
+MAX_SPACING = 1.2
+#: The same as a share of the narrowest cell.
+MAX_SPACING_SHARE = 0.1
+#: Samples on either side of the middle, of the smoothed derivative and of the kernel.
+_HALF_WIDTH = N_DERIVATIVES // 2
+#: The same of a profile.
+_REACH = 2 * _HALF_WIDTH
+#: Standard deviation of the kernel, samples.
+_KERNEL_SIGMA = 2.0
 #: A point and a step, (1, 2), times this: the places along a profile.
 _STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
-_MIN_SLOPE = 1.0  # gray levels per px: weaker edges are ignored
-#: Fainter edges, as a share of the median slope, are ignored. Those in a shadow have 0.2 of it;
-#: those of cells narrower than _NARROW, px, are faint because they run into one another.
-_FAINT, _FAINT_NARROW, _NARROW = 0.15, 0.3, 4.0
-_MIN_SHARE = 0.5  # of the edges must be found
-_WIDE = 0.5  # px between samples, for sharp images of large markers
-_FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbor,
-_NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
-_LEAST_VARIANCE = 1e-9  # px^2: to divide by
+#: Least slope of an edge, gray levels per px.
+_MIN_SLOPE = 1.0
+#: Least slope of an edge, as a share of the median: in a shadow it is 0.2.
+_MIN_SLOPE_SHARE = 0.15
+#: The same for narrow cells, whose edges blur into one another.
+_MIN_SLOPE_SHARE_NARROW = 0.3
+#: Cells up to this width are narrow, px.
+_NARROW_CELL = 4.0
+#: Least share of the edges that are found.
+_MIN_SHARE = 0.5
+#: Distance between samples for sharp images of large markers, px.
+_SHARP_SPACING = 0.5
+#: Squared distance from which on an edge does not disturb the next one, in variances of the blur.
+_UNDISTURBED_BEYOND = 25.0
+#: Least half of the squared distance that is corrected for, in variances of the blur.
+_MIN_CORRECTED = 2.5
+#: Least variance of the blur to divide by, px^2.
+_MIN_BLUR_VARIANCE = 1e-9
 #: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbor.
-_WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
-_ONES, _DIFFERENCE = np.ones(2), np.array([1.0, -1.0])
+_WITHIN = np.array([1, *range(1, 2 * _HALF_WIDTH), 2 * _HALF_WIDTH - 1])
+#: Sums both columns of (n, 2).
+_ONES = np.ones(2)
+#: Subtracts the second column of (n, 2) from the first.
+_DIFFERENCE = np.array([1.0, -1.0])
 
 
 def _correlation() -> Any:
     """Return the matrix from a profile (17,) to its smoothed derivative in the middle (9,)."""
-    k = np.arange(-_HALF, _HALF + 1.0)
+    k = np.arange(-_HALF_WIDTH, _HALF_WIDTH + 1.0)
     kernel = k * np.exp(-0.5 * (k / _KERNEL_SIGMA)**2)
     kernel /= kernel @ k  # one gray level per sample gives 1
-    matrix = np.zeros((2 * _REACH + 1, 2 * _HALF + 1), dtype=np.float32)
-    for i in range(2 * _HALF + 1):
-        matrix[i:i + 2 * _HALF + 1, i] = kernel
+    matrix = np.zeros((2 * _REACH + 1, 2 * _HALF_WIDTH + 1), dtype=np.float32)
+    for i in range(2 * _HALF_WIDTH + 1):
+        matrix[i:i + 2 * _HALF_WIDTH + 1, i] = kernel
     return matrix
 
 
@@ -108,7 +126,7 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
     model, pixels, swollen = lines.model, lines.pixels, None
     step = np.array(spacing, dtype=np.float32)[model.axis]
     along = lines.normals * step[:, None]
-    if max(map(abs, bloom.tolist())) > SWOLLEN:
+    if max(map(abs, bloom.tolist())) > MAX_PLAIN_BLOOM:
         swollen = model.bloom.dot(bloom)
         pixels = pixels + swollen[:, None] * lines.normals
     profiles = profiles_across(image, pixels, along, _STEPS, max(spacing))
@@ -123,19 +141,19 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
     before, top, after = values[index - 1], values[index], values[index + 1]
     bend = np.minimum(before - 2.0 * top + after, -1e-3)
     typical = median(top)
-    faint = _FAINT if min(lines.narrowest) > _NARROW else _FAINT_NARROW
+    faint = _MIN_SLOPE_SHARE if min(lines.narrowest) > _NARROW_CELL else _MIN_SLOPE_SHARE_NARROW
     found = (peak == within) & (top > faint * typical)
     if (typical < _MIN_SLOPE * max(spacing)
             or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
         return None
-    offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
+    offsets = (within - _HALF_WIDTH + 0.5 * (before - after) / bend) * step
     if swollen is not None:
         offsets += swollen
     first, second = ((found & one).nonzero()[0] for one in model.across)
     return Found(offsets, found, (-top / bend) * (step * step), (first, second))
 
 
-def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
+def _separate_edges(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     """
     Return where edges are without the shifts by their neighbors, and the blur of either axis, px.
 
@@ -146,13 +164,13 @@ def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     model, offsets = lines.model, found.offsets
     known = found.known
     variance = _typical(found.variance, known)
-    if any(cell**2 < _FAR * v for cell, v in zip(lines.narrowest, variance)):
+    if any(cell**2 < _UNDISTURBED_BEYOND * v for cell, v in zip(lines.narrowest, variance)):
         room = model.room * np.array(lines.scale)[model.axis][:, None]
         square = room * room
         for again in (True, True, False):
-            blurred = np.maximum(variance, _LEAST_VARIANCE)[model.axis]
+            blurred = np.maximum(variance, _MIN_BLUR_VARIANCE)[model.axis]
             normalized = square / blurred[:, None]
-            e = np.exp(np.minimum(-0.5 * normalized, -_NEAR))
+            e = np.exp(np.minimum(-0.5 * normalized, -_MIN_CORRECTED))
             bend = 1.0 + ((normalized - 1.0) * e).dot(_ONES)
             if again:
                 variance = _typical(found.variance * bend / (1.0 - e.dot(_ONES)), known)
@@ -167,48 +185,65 @@ def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
             median(variance[second]) if len(second) else 0.0)
 
 
-def _matched(lines: Lines, blur: list[float]) -> tuple[float, float]:
+def _match_spacing(lines: Lines, blur: list[float]) -> tuple[float, float]:
     """Return the spacing at which the kernel is about as wide as the image is blurred, px."""
     # Wider than the blur averages more noise, as long as the next edge stays out of it.
     first, second = (
-        min(max(sigma / _KERNEL_SIGMA, min(_WIDE, 0.12 * cell), SPACING[0]),
-            max(SPACING[1], WIDEST * cell))
+        min(max(sigma / _KERNEL_SIGMA, min(_SHARP_SPACING, 0.12 * cell), MIN_SPACING),
+            max(MAX_SPACING, MAX_SPACING_SHARE * cell))
         for sigma, cell in zip(blur, lines.narrowest))
     return first, second
 
 
-def _reaching(spacing: tuple[float, float], bloom: Array) -> tuple[float, float]:
+def _widen_for_bloom(spacing: tuple[float, float], bloom: Array) -> tuple[float, float]:
     """Return the spacing, px, with which edges are within reach although bloom shifts them."""
-    first, second = (each + shift / _HALF if shift > SWOLLEN else each
+    first, second = (each + shift / _HALF_WIDTH if shift > MAX_PLAIN_BLOOM else each
                      for each, shift in zip(spacing, np.abs(bloom).tolist()))
     return first, second
 
 
-def _searching(lines: Lines) -> tuple[float, float]:
+def _search_spacing(lines: Lines) -> tuple[float, float]:
     """Return the spacing, px, at which edges half a cell away are still within reach."""
-    first, second = (max(cell / (2 * _HALF), SPACING[0]) for cell in lines.narrowest)
+    first, second = (max(cell / (2 * _HALF_WIDTH), MIN_SPACING) for cell in lines.narrowest)
     return first, second
 
 
-#: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
-MIN_INLIERS, MAX_RMS = 0.5, 0.4
-#: An edge is in place if the fit explains it to within this, px, or three times the RMS.
-INLIER = 0.4
-_SIGMA_BLOOM = 0.35  # px, of either shift
-SWOLLEN = 0.7  # px: edges that bloom shifts by more are looked for where it shifts them
-_FLOOR = 0.03  # px: least standard deviation of an edge's place
-#: The error of a step grows with its square, and falls with the marker's size: if the square is
-#: more than this times the narrowest cell, px, edges are looked for again;
-_AGAIN = 0.2
-ANEW = 1.5  # px: if the pose moved an edge by more, they are projected anew
-_TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
-_PASSES = 5
-LONGEST_TURN = 1.0  # rad: after a longer step the edges must be found again
-_SETTLED = 2.0  # the last step may be so many times as long: no edges are looked for after it
-_EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
-_CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
-_BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
-_UNKNOWN, _NO_BLOOM = np.full(2, _FLOOR**2), np.zeros(2)
+#: Least share of the edges that agree with an accepted pose.
+MIN_INLIERS = 0.5
+#: Largest RMS of the residuals of an accepted pose, px.
+MAX_RMS = 0.4
+#: Largest residual of an edge in place, px, or three times the RMS if that is more.
+MAX_INLIER_ERROR = 0.4
+#: Prior of either shift of bloom, px (1 sigma).
+_SIGMA_BLOOM = 0.35
+#: Edges that bloom shifts by more, px, are looked for where it shifts them.
+MAX_PLAIN_BLOOM = 0.7
+#: Least standard deviation of an edge's place, px.
+_MIN_SIGMA = 0.03
+#: Edges are found again after a step whose square exceeds this times the narrowest cell, px: the
+#: error of a step grows with its square, and falls with the marker's size.
+_REFIND_BEYOND = 0.2
+#: Edges are projected again if the pose moved one by more, px.
+REPROJECT_BEYOND = 1.5
+#: The same for a turn, rad: seen from the front, it hardly moves edges, and not in proportion.
+_REPROJECT_TURN = 0.04
+#: Most steps of a fit.
+_MAX_PASSES = 5
+#: A step that turns by more, rad, leads nowhere.
+MAX_TURN_STEP = 1.0
+#: The last step may be this much longer than one after which edges are found again.
+_FINAL_STEP_FACTOR = 2.0
+#: Least share of the edges of either axis, by weight, that a pose rests on.
+_MIN_AXIS_SHARE = 0.1
+#: Edges are found again while a smaller share of them, by weight, agrees.
+_REFIND_BELOW = 0.75
+#: Edges are found again if the kernel is wider or narrower than the blur by this factor.
+_MAX_MISMATCH = 1.6
+#: Variances of an edge's place of either axis before any is known, px^2.
+_INITIAL_VARIANCE = np.full(2, _MIN_SIGMA**2)
+#: Bloom before any is known, px.
+_NO_BLOOM = np.zeros(2)
+#: Prior of the pose (6) and of both shifts of bloom.
 _PRIOR = np.diag([0.0] * 6 + [_SIGMA_BLOOM**-2] * 2)
 
 
@@ -257,54 +292,54 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
     bloom: Array = _NO_BLOOM
     lines = project(camera, model, start)
     if lines is not None and spacing is None:
-        spacing = _searching(lines)
-    for count in range(_PASSES):
+        spacing = _search_spacing(lines)
+    for count in range(_MAX_PASSES):
         found = None if lines is None or spacing is None else _find(image, lines, spacing, bloom)
         if lines is None or spacing is None or found is None:
             return None
-        found, widths = _apart(lines, found)
+        found, widths = _separate_edges(lines, found)
         step = _solve(lines, found, last)
         turn = math.inf if step is None else max(map(abs, step.step[3:6].tolist()))
-        if step is None or not turn < LONGEST_TURN:
+        if step is None or not turn < MAX_TURN_STEP:
             return None
         pose = moved(pose, lines.center, step.step)
         lines, bloom = lines.moved(step.step, step.explained), step.step[6:]
         blur = [math.sqrt(max(width**2 - (_KERNEL_SIGMA * each)**2, 0.0))
                 for width, each in zip(widths, spacing)]
-        suited = _matched(lines, blur)
-        alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, spacing))
-        clear = float(step.weights.sum()) > _CLEAR * len(model)
-        farthest, turned = float(np.abs(step.explained).max()), turn > _TURNED
-        near = _AGAIN * min(lines.narrowest)
+        suited = _match_spacing(lines, blur)
+        alike = all(1.0 / _MAX_MISMATCH < a / b < _MAX_MISMATCH for a, b in zip(suited, spacing))
+        clear = float(step.weights.sum()) > _REFIND_BELOW * len(model)
+        farthest, turned = float(np.abs(step.explained).max()), turn > _REPROJECT_TURN
+        near = _REFIND_BEYOND * min(lines.narrowest)
         settled = farthest * farthest < near and alike and clear and not turned
-        if settled or count == _PASSES - 1:
-            if not settled and farthest * farthest > _SETTLED**2 * near:
+        if settled or count == _MAX_PASSES - 1:
+            if not settled and farthest * farthest > _FINAL_STEP_FACTOR**2 * near:
                 return None
-            return _fitted(pose, lines, found, step, suited, blur)
+            return _build_fit(pose, lines, found, step, suited, blur)
         spacing = suited
         # A fit to a part of the edges must not exclude the others.
         last = step if clear else None
-        if farthest > ANEW or turned:
+        if farthest > REPROJECT_BEYOND or turned:
             lines = project(camera, model, pose)
     return None
 
 
-def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
+def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
             spacing: tuple[float, float], blur: list[float]) -> EdgeFit | None:
     """Return the fit that ends with a step, None if it is poor or leaves a direction open."""
-    if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
+    if not (last.weights.dot(lines.model.bloom) < -_MIN_AXIS_SHARE * lines.model.counts).all():
         return None
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
     square = float(last.weights.dot(last.squares)) / degrees
-    in_place = np.count_nonzero(found.found & (last.squares < max(INLIER**2, 9.0 * square)))
-    inliers, rms = in_place / len(lines.model), math.sqrt(square)
+    in_place = found.found & (last.squares < max(MAX_INLIER_ERROR**2, 9.0 * square))
+    inliers, rms = np.count_nonzero(in_place) / len(lines.model), math.sqrt(square)
     covariance = normal_covariance(last.information)
     if covariance is None or not (inliers > MIN_INLIERS and rms < MAX_RMS):
         return None
     weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(
         pose, lines.center, covariance[:6, :6], rms, float(weights.dot(last.squares)) / degrees,
-        degrees, inliers, _reaching(spacing, last.step[6:]),
+        degrees, inliers, _widen_for_bloom(spacing, last.step[6:]),
         max(width / cell for width, cell in zip(blur, lines.narrowest)),
         float(np.abs(last.step[6:]).max()), lines, last.residual, weights)
 
@@ -335,7 +370,7 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
     axis, design, offsets = lines.model.axis, lines.design, found.offsets
     groups = lines.model.bloom  # (n, 2): -1 for the edges of an axis, else 0
     weights = found.found if last is None else last.weights * found.found
-    variance = _UNKNOWN if last is None else last.variance
+    variance = _INITIAL_VARIANCE if last is None else last.variance
     for again in range(2):
         weighted = design * (weights / variance[axis])[:, None]
         information = weighted.T.dot(design) + _PRIOR
@@ -352,8 +387,8 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
         else:
             variance = ((weights * squares).dot(groups)
                         / np.minimum(weights.dot(groups) + 4.0, -1.0))
-        variance = np.maximum(variance, _FLOOR**2)
-        weights = 1.0 - squares / np.maximum(16.0 * variance, INLIER**2)[axis]
+        variance = np.maximum(variance, _MIN_SIGMA**2)
+        weights = 1.0 - squares / np.maximum(16.0 * variance, MAX_INLIER_ERROR**2)[axis]
         weights = np.maximum(weights, 0.0)**2 * found.found
     explained = design[:, :6].dot(step[:6])
     return _Step(step, explained, residual, squares, weights, variance, information)

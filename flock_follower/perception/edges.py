@@ -43,8 +43,15 @@ _CHOLESKY = cv2.DECOMP_CHOLESKY
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
 _LEAST_DEPTH = 0.02  # m
 _DIVERGED = 1e4  # m: a fit that leads beyond, or to NaN, has diverged
+#: np.min and np.max without their overhead.
 _LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
-_ONES, _MINUS, _SUM = np.ones(2), -np.ones(2), np.ones(3)
+#: Sums both columns of (n, 2).
+_ONES = np.ones(2)
+#: Sums both columns of (n, 2), negated.
+_MINUS = -_ONES
+#: Sums all columns of (n, 3).
+_SUM = np.ones(3)
+#: A row vector times this is turned by a right angle.
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 #: a x b of rows a, b: their outer products, (n, 9), times this.
 _CROSS = np.zeros((9, 3))
@@ -116,14 +123,14 @@ class Lines(NamedTuple):
 
 def facing(model: EdgeModel, pose: Transform) -> Any:
     """Return which markers turn their front to the camera, less than 80 degrees aside, (m,)."""
-    if not within_reason(pose):
+    if not has_converged(pose):
         return np.zeros(len(model.centers), dtype=bool)
     sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
     along = (sight * model.facings).dot(_SUM)
     return -along > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
 
 
-def within_reason(pose: Transform) -> bool:
+def has_converged(pose: Transform) -> bool:
     x, y, z = pose.translation.tolist()
     return abs(x) + abs(y) + abs(z) < _DIVERGED
 
@@ -135,7 +142,7 @@ def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | N
     All markers of the model must face the camera.
     """
     count = len(model)
-    if not within_reason(pose):
+    if not has_converged(pose):
         return None
     R = pose.rotation.T
     places = model.places.dot(R)

@@ -48,8 +48,9 @@ from flock_follower.perception.neighbor_motion import FilterParams
 SAME = 0.3
 #: Tolerance of the distance of a restart, m: errors of both places.
 SLACK = 0.3
-#: A candidate has moved if it covers this distance, m, within WINDOW, s.
+#: A candidate has moved if it covers this distance, m, within WINDOW.
 MOVED = 0.5
+#: Time in which a moving candidate covers MOVED, s.
 WINDOW = 5.0
 #: A candidate with fewer measurements may be a false detection.
 CONFIRMED = 3

@@ -39,10 +39,11 @@ from typing import Final
 import numpy as np
 
 from flock_follower.geometry import Array, skew
-from flock_follower.perception.measurement import WIDENING
+from flock_follower.perception.measurement import DEVIATION_FACTOR
 
-#: Number of innovations over which the noise is learned; initial count of innovations.
+#: Innovations over which the noise is learned.
 LEARNED = 120
+#: Initial count of innovations.
 FIRST = 15
 #: The square of an innovation is limited to this many times its variance.
 LIMIT = 16.0
@@ -52,7 +53,8 @@ MOST = 0.05
 LEAST = 0.04
 #: Lower limit of the shares of a measured pose's variances. It is not that of independent edges: a
 #: marker seen from the front errs now and then by more, and alike for some images.
-LEAST_SHARE = 1.0 / WIDENING
+LEAST_SHARE = 1.0 / DEVIATION_FACTOR
+#: From a turn to the change of a measured pose, of which the upper half depends on the sight.
 _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
@@ -141,13 +143,15 @@ def _excess(squared: float, expected: float) -> float:
     return min(squared, LIMIT * expected) - expected
 
 
-#: Time constants, s: of the mean innovation, of the noise that it is compared with, and of the
-#: learned motion.
+#: Time constant of the mean innovation, s.
 MEAN_TIME: Final = 0.25
+#: Time constant of the noise that the mean innovation is compared with, s.
 NOISE_TIME: Final = 2.0
+#: Time constant of the learned motion, s.
 MOTION_TIME: Final = 2.0
-#: Limit of the surplus of one image; limits of the factor.
+#: Limit of the surplus of one image.
 STRONGEST: Final = 4.0
+#: Limits of the factor.
 FACTORS: Final = (0.2, 16.0)
 #: After a longer gap, s, the step is not learned: the mean restarts, and the factor is at least 1,
 #: so ``FilterParams`` holds.

@@ -30,8 +30,9 @@ import numpy as np
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
 from flock_follower.perception.edges import moved
 
-#: Errors of an expected attitude, and lean of a neighbor, rad (1 sigma).
+#: Error of an expected attitude, rad (1 sigma).
 SIGMA_HISTORY = 0.1
+#: Lean of a neighbor, rad (1 sigma).
 SIGMA_UPRIGHT = 0.25
 #: History may not outweigh the image for ever: its contribution to chi^2 is capped.
 MAX_HISTORY = 9.0
@@ -98,7 +99,7 @@ def angle(a: Transform, b: Transform) -> float:
 
 #: Deviations are widened by this, because neighboring edges share pixels, and the errors by
 #: calibration and blur are the same for all.
-WIDENING = 1.5
+DEVIATION_FACTOR = 1.5
 
 
 class Measurement(NamedTuple):

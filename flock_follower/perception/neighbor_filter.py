@@ -55,14 +55,14 @@ from flock_follower.perception.neighbor_motion import (
     POSE,
     POSITION,
     RATE,
-    SIZE,
+    STATE_SIZE,
     transition,
     turned_along,
     VELOCITY,
 )
 from flock_follower.perception.range_gate import RangeGate
 
-_IDENTITY = np.eye(SIZE)
+_IDENTITY = np.eye(STATE_SIZE)
 #: Rows of the error state that are measured if the attitude is not used.
 _PLACE = _IDENTITY[POSITION]
 #: States to which the drift of the own position adds noise, (15, 15).
@@ -71,19 +71,21 @@ _WANDERING = _PLACE.T.dot(_PLACE)
 _MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
 _TURNING = np.r_[ATTITUDE, RATE]
 #: chi^2 with 3 degrees of freedom at a probability of 0.999.
-GATE = 16.27
+GATE_CHI2 = 16.27
 #: A measurement is refused if its chi^2 is so many times the gate's: 13 standard deviations.
-WILD = 10.0
+WILD_FACTOR = 10.0
 #: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
 MIRRORED = 0.3
-#: An attitude is wrong if so many measurements in a row contradict it, for so long, s: so that at
-#: a low rate of images a track turns round as soon as at a high one.
-LEAST_TURNED, TURNED_FOR = 3, 0.19
+#: An attitude is wrong if this many measurements in a row contradict it, for CONTRADICTED_FOR.
+MIN_CONTRADICTIONS = 3
+#: Time for which measurements contradict a wrong attitude, s: the same at every rate of images.
+CONTRADICTED_FOR = 0.19
 #: Nearer than this, m, a distance has no direction.
 NEAREST = 0.01
 #: Of a state that is moved, the velocity is uncertain by the way divided by this, s.
 SETTLING = 0.2
-_CENTER = np.zeros(3)
+#: The middle of a body, m.
+_BODY_CENTER = np.zeros(3)
 _UNSCALED = [1.0] * 6  # attitude and its rate
 
 
@@ -116,8 +118,8 @@ class NeighborFilter:
 
     A measurement outside the gate is used with less weight. The first gets the weight that puts it
     on the gate: it may be wrong. If the next one is off to the same side, the track is wrong, and
-    the covariance of the prediction grows. A measurement that is ``WILD``, or outside the gate and
-    out of reach, is refused: ``hypotheses`` tracks it separately.
+    the covariance of the prediction grows. A measurement beyond ``WILD_FACTOR``, or
+    outside the gate and out of reach, is refused: ``hypotheses`` tracks it separately.
     """
 
     def __init__(self, params: FilterParams | None = None) -> None:
@@ -138,7 +140,7 @@ class NeighborFilter:
         self._surprises: dict[str, Array] = {}
         self._alike = AlikeErrors()
         self._range_gate = RangeGate(most=self.params.max_rejections)
-        self._line = _CENTER  # on which the last distance was measured
+        self._line = _BODY_CENTER  # on which the last distance was measured
         self._motion = LearnedMotion()
         self._before: tuple[Array, Array] | None = None  # the last innovation, its covariance
 
@@ -227,7 +229,7 @@ class NeighborFilter:
         if now is None or expected is None:
             return self._start(stamp, T_odom_body, reference, covariance, whole)
 
-        prior, plausible, jacobian, noise, innovation = self._compared(
+        prior, plausible, jacobian, noise, innovation = self._compare(
             expected, T_odom_body, reference, covariance)
         if root is not None:
             root = to_body(T_odom_body.rotation.dot(reference)).dot(root) if plausible else (
@@ -237,11 +239,11 @@ class NeighborFilter:
         across, spread = expected_innovation(prior, jacobian, noise, shared)
 
         nominal = spread
-        doubt = squared_distance(innovation[:3], nominal[:3, :3]) / GATE
+        doubt = squared_distance(innovation[:3], nominal[:3, :3]) / GATE_CHI2
         solved, gain = False, np.zeros(0)
         reached = doubt <= 1.0 or math.dist(T_odom_body.translation, now.position) <= reach
-        if reached and doubt <= WILD:  # NaN is not
-            if self._again('position', innovation[:3], doubt):
+        if reached and doubt <= WILD_FACTOR:  # NaN is not
+            if self._surprises_again('position', innovation[:3], doubt):
                 prior = widened(prior, _MOVING, doubt)
                 across, spread = expected_innovation(prior, jacobian, noise, shared)
             elif doubt > 1.0:
@@ -251,7 +253,7 @@ class NeighborFilter:
         if not solved:
             return UpdateOutcome.OUTLIER
         self._turned = [] if plausible else [*self._turned, stamp]
-        if self._contradicted(stamp):
+        if self._is_contradicted(stamp):
             return self._start(stamp, T_odom_body, reference, covariance, whole, expected)
         self._learn(stamp - now.stamp, innovation, nominal)
         # Joseph's form stays symmetric and positive whatever the rounding.
@@ -261,17 +263,17 @@ class NeighborFilter:
             common = remain.dot(shared).dot(gain)
             corrected -= common + common.T
         self._alike.take(remain, gain.T, root)
-        self._predicted, self._line = None, _CENTER
+        self._predicted, self._line = None, _BODY_CENTER
         self.newest = expected.corrected(gain.T.dot(innovation), corrected)
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
 
-    def _contradicted(self, stamp: float) -> bool:
+    def _is_contradicted(self, stamp: float) -> bool:
         """Return whether measurements have contradicted the attitude for long enough."""
         count = len(self._turned)
         return count >= self.params.max_rejections or (
-            count >= LEAST_TURNED and stamp - self._turned[0] >= TURNED_FOR)
+            count >= MIN_CONTRADICTIONS and stamp - self._turned[0] >= CONTRADICTED_FOR)
 
     def _learn(self, dt: float, innovation: Array, covariance: Array) -> None:
         """Learn from an innovation (6,), or (3,) of the position only, dt, s, after another."""
@@ -282,7 +284,7 @@ class NeighborFilter:
             self.change = Change(innovation[:n] - before[0][:n],
                                  covariance[:n, :n] + before[1][:n, :n])
 
-    def _compared(self, expected: Estimate, T_odom_body: Transform, reference: Array,
+    def _compare(self, expected: Estimate, T_odom_body: Transform, reference: Array,
                   covariance: Array) -> tuple[Array, bool, Array, Array, Array]:
         """
         Compare a measurement with the expected state, the attitude first.
@@ -294,11 +296,11 @@ class NeighborFilter:
         prior = expected.covariance
         turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
         spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
-        doubt = squared_distance(turn, spread) / GATE
+        doubt = squared_distance(turn, spread) / GATE_CHI2
         # A marker's mirrored pose has its position right and its attitude wrong.
-        plausible = doubt <= 1.0 or (doubt <= WILD and float(turn.dot(turn)) < MIRRORED**2)
+        plausible = doubt <= 1.0 or (doubt <= WILD_FACTOR and float(turn.dot(turn)) < MIRRORED**2)
         if plausible:
-            if self._again('attitude', turn, doubt):
+            if self._surprises_again('attitude', turn, doubt):
                 prior = widened(prior, _TURNING, doubt)
             elif doubt > 1.0:
                 covariance = covariance.copy()
@@ -315,7 +317,7 @@ class NeighborFilter:
         return prior, False, jacobian, covariance[:3, :3], innovation
 
     def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
-                     reference: Array = _CENTER) -> UpdateOutcome:
+                     reference: Array = _BODY_CENTER) -> UpdateOutcome:
         """
         Update with the own distance, m, to ``reference`` (3,), a point on the body, m.
 
@@ -349,7 +351,7 @@ class NeighborFilter:
         across = prior[:, POSITION].dot(along)
         expected_spread = float(along.dot(across[POSITION]))
         whole = factors[1] * (expected_spread + noise)
-        gain = np.zeros(SIZE)
+        gain = np.zeros(STATE_SIZE)
         for part in (POSITION, VELOCITY, ACCELERATION):
             gain[part] = float(along.dot(across[part])) / whole * along
         remain = _IDENTITY.copy()
@@ -363,7 +365,7 @@ class NeighborFilter:
             covariance, along, length, self.params.initial_speed))
         return UpdateOutcome.USED if factors == (1.0, 1.0) else UpdateOutcome.SURPRISING
 
-    def _again(self, quantity: str, innovation: Array, doubt: float) -> bool:
+    def _surprises_again(self, quantity: str, innovation: Array, doubt: float) -> bool:
         """Return whether an innovation (3,) surprises for the second time in one direction."""
         before = self._surprises.pop(quantity, None)
         if doubt <= 1.0:

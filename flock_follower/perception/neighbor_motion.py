@@ -46,9 +46,9 @@ from flock_follower.ranges import Checked, parameter, Range
 
 #: Slices of the error state.
 POSITION, VELOCITY, ATTITUDE, RATE, ACCELERATION = (slice(k, k + 3) for k in range(0, 15, 3))
-SIZE = 15
+STATE_SIZE = 15
 #: Rows of the error state that form a pose, (6, 15).
-POSE = np.concatenate([np.eye(SIZE)[POSITION], np.eye(SIZE)[ATTITUDE]])
+POSE = np.concatenate([np.eye(STATE_SIZE)[POSITION], np.eye(STATE_SIZE)[ATTITUDE]])
 
 
 class Estimate(NamedTuple):
@@ -126,7 +126,7 @@ class Estimate(NamedTuple):
     def child_twist_covariance(self) -> Array:
         """Return the covariance (6, 6) of ``child_twist``, the attitude's share included."""
         # R_true^T v_true = R^T (1 - [dr]x)(v + dv) = R^T (v + dv + [v]x dr).
-        jacobian: Array = np.zeros((6, SIZE))
+        jacobian: Array = np.zeros((6, STATE_SIZE))
         jacobian[:3, VELOCITY] = jacobian[3:, RATE] = np.eye(3)
         jacobian[:3, ATTITUDE] = skew(self.velocity)
         jacobian[3:, ATTITUDE] = skew(self.angular_velocity)
@@ -136,7 +136,7 @@ class Estimate(NamedTuple):
         return jacobian @ self.covariance @ jacobian.T
 
 
-_EYE = np.eye(3)
+_EYE_3 = np.eye(3)
 #: Random walk of the own position without a measured velocity, m/sqrt(s).
 ODOMETRY_WALK = 0.02
 #: Standard deviation of a neighbor's angular velocity before any motion was seen, rad/s.
@@ -212,14 +212,14 @@ def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
     See :func:`motion`; dt is in s.
     """
     linear, jerk = motion(dt, params)
-    whole, noise = np.eye(SIZE), np.zeros((SIZE, SIZE))
+    whole, noise = np.eye(STATE_SIZE), np.zeros((STATE_SIZE, STATE_SIZE))
     order = (POSITION, VELOCITY, ACCELERATION)
     for i, row in enumerate(order):
         for k, column in enumerate(order):
-            whole[row, column] = linear[i, k] * _EYE
-            noise[row, column] = jerk[i, k] * _EYE
-    whole[ATTITUDE, RATE] = dt * _EYE
-    noise[6:12, 6:12] = np.kron(params.angular_noise**2 * _walk(abs(dt)), _EYE)
+            whole[row, column] = linear[i, k] * _EYE_3
+            noise[row, column] = jerk[i, k] * _EYE_3
+    whole[ATTITUDE, RATE] = dt * _EYE_3
+    noise[6:12, 6:12] = np.kron(params.angular_noise**2 * _walk(abs(dt)), _EYE_3)
     return linear, whole, noise
 
 
@@ -232,8 +232,8 @@ def turned_along(covariance: Array, before: Array, now: Array) -> Array:
     that line. ``before`` of zeros turns nothing.
     """
     cross = skew(np.cross(before, now))
-    turn = _EYE + cross + cross @ cross / max(1.0 + float(before.dot(now)), 0.1)
-    whole = np.eye(SIZE)
+    turn = _EYE_3 + cross + cross @ cross / max(1.0 + float(before.dot(now)), 0.1)
+    whole = np.eye(STATE_SIZE)
     for part in (POSITION, VELOCITY, ACCELERATION):
         whole[part, part] = turn
     return whole @ covariance @ whole.T
@@ -247,9 +247,9 @@ def bounded_across(covariance: Array, along: Array, distance: float, speed: floa
     most the distance, and that of the velocity at most ``speed``, m/s. Larger ones would make the
     distance uncertain after a small turn of the line.
     """
-    scale, line = np.eye(SIZE), np.outer(along, along)
+    scale, line = np.eye(STATE_SIZE), np.outer(along, along)
     for part, most in ((POSITION, distance), (VELOCITY, speed)):
-        across = float(((_EYE - line) * covariance[part, part]).sum())
+        across = float(((_EYE_3 - line) * covariance[part, part]).sum())
         share = min(most / math.sqrt(max(0.5 * across, 1e-12)), 1.0)
-        scale[part, part] = line + share * (_EYE - line)
+        scale[part, part] = line + share * (_EYE_3 - line)
     return scale @ covariance @ scale.T

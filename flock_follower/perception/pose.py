@@ -30,19 +30,25 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN, SWOLLEN
+from flock_follower.perception.edge_fit import (
+    EdgeFit,
+    fit,
+    MAX_PLAIN_BLOOM,
+    MAX_TURN_STEP,
+    REPROJECT_BEYOND,
+)
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import (
     angle,
     Choice,
     choose,
+    DEVIATION_FACTOR,
     Hypothesis,
     Measurement,
     PosePrior,
     SAME_ATTITUDE,
     widened,
-    WIDENING,
 )
 from flock_follower.perception.print_model import edge_model, EdgeModel, shows_code
 from flock_follower.perception.smear_fit import (
@@ -70,8 +76,9 @@ SHARP_RMS = 0.15  # px
 #: Share of the variances of errors that are alike from image to image, unless edges are plain.
 ALIKE_SHARE = 0.8
 #: Plain edges are blurred by less than this share of a cell (1 sigma) and shifted by less than
-#: SWOLLEN, and more than PLAIN_INLIERS of them agree.
+#: MAX_PLAIN_BLOOM.
 PLAIN_BLUR = 0.2
+#: Least share of plain edges that agree.
 PLAIN_INLIERS = 0.9
 #: If edges are blurred by more than this share of a cell (1 sigma), the whole print says more.
 RUN_TOGETHER = 0.25
@@ -169,7 +176,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
     chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
     if len(found.lines.model.codes) > 1:
         return _measurement(sought, found, Choice(chosen, math.inf))
-    best = choose([chosen, *_mirrored(camera, found)], expected)
+    best = choose([chosen, *_mirrored_hypotheses(camera, found)], expected)
     if best.chosen.fit is None:
         again = fit(image, camera, found.lines.model, best.chosen.pose, spacing)
         found = found if again is None else again
@@ -190,11 +197,11 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
-    fits = [one for one in near if one.inliers > FOUND_INLIERS and _shown(image, one).all()]
+    fits = [one for one in near if one.inliers > FOUND_INLIERS and _find_shown(image, one).all()]
     if not fits:
         return None if not smeared or any(map(_sharp, near)) else _without_edges(
             image, camera, sought, index, starts, expected)
-    variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
+    variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * DEVIATION_FACTOR)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
@@ -233,7 +240,7 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
         return _Shown(None)
     seen = model.only(turned)
     found = fit(image, camera, seen, start, spacing)
-    shown = None if found is None else _shown(image, found, True)
+    shown = None if found is None else _find_shown(image, found, True)
     if shown is not None and shown.all():
         return _Shown(found)
     if len(seen.codes) == 1:
@@ -241,16 +248,17 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if shown is None:  # one that is covered spoils them all
         alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
                  for k in range(len(seen.codes))]
-        shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
+        shown = np.array([f is not None and bool(_find_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
         return _Shown(None)
     found = fit(image, camera, seen.only(shown), start, spacing)
-    return _Shown(found if found is not None and _shown(image, found, True).all() else None)
+    return _Shown(found if found is not None and _find_shown(image, found, True).all() else None)
 
 
 def _plain(found: EdgeFit) -> bool:
     """Return whether edges have no errors that last: by a smear, over-exposure or a reflex."""
-    return found.blur < PLAIN_BLUR and found.bloom < SWOLLEN and found.inliers > PLAIN_INLIERS
+    return (found.blur < PLAIN_BLUR and found.bloom < MAX_PLAIN_BLOOM
+            and found.inliers > PLAIN_INLIERS)
 
 
 def _sharp(found: EdgeFit) -> bool:
@@ -322,10 +330,10 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
     return Measurement(
         sought.neighbor.name, found.pose,
         sought.neighbor.markers[index].T_body_marker.translation,
-        found.covariance * WIDENING**2, found.rms, None, alike=ALIKE_SHARE)
+        found.covariance * DEVIATION_FACTOR**2, found.rms, None, alike=ALIKE_SHARE)
 
 
-def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
+def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
     lines, codes = found.lines, found.lines.model.codes
     if len(codes) == 1:
@@ -336,10 +344,10 @@ def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
 
 def _scale(found: EdgeFit) -> float:
     """Return the factor on its variances."""
-    return max(found.chi2, 1.0) * WIDENING**2
+    return max(found.chi2, 1.0) * DEVIATION_FACTOR**2
 
 
-def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
+def _mirrored_hypotheses(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     """Return the other pose that may suit the edges of a single marker, if there is one."""
     start = mirror(found.pose, found.center, found.lines.model.facings[0])
     if start is None:
@@ -367,11 +375,11 @@ def _refit(camera: CameraModel, fitted: EdgeFit,
         design = lines.design[:, :6]
         moment = (design * fitted.weights[:, None]).T
         step = solve_normal(moment.dot(design), moment.dot(offsets))
-        if step is None or not float(np.abs(step[3:]).max()) < LONGEST_TURN:
+        if step is None or not float(np.abs(step[3:]).max()) < MAX_TURN_STEP:
             return None
         pose = moved(pose, lines.center, step)
         explained = design.dot(step)
-        if float(np.abs(explained).max()) < ANEW:
+        if float(np.abs(explained).max()) < REPROJECT_BEYOND:
             break
     residual = offsets - explained
     return pose, float(fitted.weights.dot(residual * residual))

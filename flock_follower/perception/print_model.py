@@ -49,7 +49,7 @@ _MIN_APART = 4.0  # gray levels between black and white, both in the shade
 #: Black or white cells are not used if their variance exceeds this share of the squared half of
 #: their contrast.
 _MAX_SPREAD = 0.35
-_SATURATED = 250.0  # gray levels
+_SATURATED_LEVEL = 250.0  # gray levels
 
 
 class Windows(NamedTuple):
@@ -99,7 +99,7 @@ def read(brightness: Array, seen: Windows) -> Array:
     values = brightness.astype(float)[:, seen.cells]
     sums = []
     # A cell is not compared with itself, and with no saturated cell that should be black.
-    for color in (seen.white, seen.black * (values < _SATURATED)):
+    for color in (seen.white, seen.black * (values < _SATURATED_LEVEL)):
         some = values * color
         sums.append([total.sum(axis=-1, keepdims=True) - total
                      for total in (color, some, some * values)])
@@ -205,7 +205,7 @@ def _few_wrong(agreeing: Array, brightness: Array, code: CellCode, tracked: bool
     correctable = np.count_nonzero(agreeing <= 0.0) <= code.errors
     if tracked:
         return correctable
-    if correctable and (brightness[:code.bits.size + code.border] >= _SATURATED).any():
+    if correctable and (brightness[:code.bits.size + code.border] >= _SATURATED_LEVEL).any():
         agreeing = agreeing[code.bits > 0.0]  # a reflex turns no white cell black
     return _wrong(agreeing) < max(0.5 * code.errors, 1.0)
 
@@ -218,7 +218,7 @@ def _wrong(agreeing: Array) -> float:
 def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> bool:
     """Return whether cells of brightness (n, c), n places in each, are those of a marker."""
     colors = read(brightness, code.windows).mean(axis=0)
-    saturated: Any = (brightness >= _SATURATED).any(axis=0)
+    saturated: Any = (brightness >= _SATURATED_LEVEL).any(axis=0)
     end = code.bits.size + code.border
     inner, border, around = slice(code.bits.size), slice(code.bits.size, end), slice(end, None)
     # A reflex hides black cells, and brightens those beside. It cannot be told from paper that is
@@ -256,7 +256,7 @@ _END = 0.4  # cells kept clear of the ends of a run
 _BORDER_POINTS = 10  # along each outer edge
 _INNER_SPACING = 0.6  # cells
 #: Of brightness across an edge, taken of every one.
-DERIVATIVES = 9
+N_DERIVATIVES = 9
 
 
 class EdgeModel:
@@ -289,8 +289,8 @@ class EdgeModel:
         self.bloom = -np.eye(2)[axis]
         # The mean of the points is this times them, (n,).
         self.shares = np.full(len(self), 1.0 / max(len(self), 1))
-        # Where the derivatives of each edge begin, of DERIVATIVES each, (n,).
-        self.begins = DERIVATIVES * np.arange(len(self))
+        # Where the derivatives of each edge begin, of N_DERIVATIVES each, (n,).
+        self.begins = N_DERIVATIVES * np.arange(len(self))
         self._parts: dict[bytes, EdgeModel] = {}
 
     def __len__(self) -> int:
@@ -355,7 +355,7 @@ def _edges(code: Any) -> list[_Edge]:
                 light = float(step[first])
                 if not light:
                     continue
-                for along in _along(first - 1.0, last - 1.0, column in (0, cells)):
+                for along in _points_along(first - 1.0, last - 1.0, column in (0, cells)):
                     room = _room(grid[int(along) + 1], column, light > 0.0)
                     x, y = column - cells / 2.0, along - cells / 2.0
                     # Rows run down, the marker's y axis up: white to the right is the normal +x,
@@ -365,7 +365,7 @@ def _edges(code: Any) -> list[_Edge]:
     return edges
 
 
-def _along(start: float, end: float, border: bool) -> Array:
+def _points_along(start: float, end: float, border: bool) -> Array:
     """Return where along a run to look, in cells."""
     count = _BORDER_POINTS if border else (
         1 + int(np.ceil((end - start - 2.0 * _END) / _INNER_SPACING)))

@@ -37,10 +37,10 @@ from flock_follower.perception.markers import Detections, joined, marker_code
 from flock_follower.perception.search import everywhere
 
 #: Cells of the black border that are told apart; the first is that of our prints.
-BORDERS = (1, 2, 3)
+BORDER_WIDTHS = (1, 2, 3)
 #: Each border, and how far inside its outline, cells, a detector may find one: if black is wide, a
 #: threshold taken from the surroundings leaves only its rim dark.
-_OUTLINES = tuple((border, 0.5 * half) for border in BORDERS for half in range(2 * border))
+_OUTLINES = tuple((border, 0.5 * half) for border in BORDER_WIDTHS for half in range(2 * border))
 #: Samples along a cell, either way: where edges are tells borders apart.
 _SAMPLES = 3
 #: Least correlation of an image with a print of another border.
@@ -97,7 +97,7 @@ def border_cells(image: GrayImage, corners: Array, dictionary: str, marker_id: i
     best = int(np.argmax(likeness))
     clear = likeness[best] > _MIN_LIKENESS and (
         1.0 - likeness[best] < _MAX_LEFT * (1.0 - likeness[0]))
-    return _OUTLINES[best][0] if clear else BORDERS[0]
+    return _OUTLINES[best][0] if clear else BORDER_WIDTHS[0]
 
 
 class Fault(NamedTuple):
@@ -112,19 +112,20 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
                  ) -> Fault | None:
     """Return the fault of a detected marker's border, or None."""
     cells = border_cells(image, corners, dictionary, marker.marker_id)
-    return None if cells == BORDERS[0] else Fault(
+    return None if cells == BORDER_WIDTHS[0] else Fault(
         WRONG_BORDER, f'marker {marker.marker_id} has a black border of {cells} cells',
         f'print it with a border of one cell: marker --dictionary {dictionary}')
 
 
 def with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
     """Return the markers with a border of two or three cells, and some with one."""
-    return joined(*(everywhere(image, dictionary, border=border) for border in BORDERS[1:]))
+    return joined(*(everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
 
 
 def border_sought(rounds: int) -> int:
     """Return the border, cells, to search for if so many whole images were searched before."""
-    return BORDERS[rounds % _ROUNDS] if rounds % _ROUNDS < len(BORDERS) else BORDERS[0]
+    which = rounds % _ROUNDS
+    return BORDER_WIDTHS[which if which < len(BORDER_WIDTHS) else 0]
 
 
 def lean(R_camera_body: Array, up: Array) -> float:

@@ -36,10 +36,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import (
+    has_converged,
     moved,
     normal_covariance,
     solve_normal,
-    within_reason,
 )
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.print_model import median
@@ -69,9 +69,9 @@ _MIN_FIT_LIKENESS = 0.95
 #: Least difference of white and black, gray levels.
 _MIN_CONTRAST = 10.0
 #: Most steps of a descent.
-_MAX_PASSES = 10
+_MAX_PASSES = 12
 #: First steps, in which that of the smear is halved.
-_DAMPED_PASSES = 2
+_DAMPED_PASSES = 3
 #: A step that turns by less, rad, may be the last.
 _LAST_TURN = 0.02
 #: A step of pose and smear that is shorter, cells, may be the last.
@@ -153,7 +153,7 @@ def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
 
     :param near: whether ``start`` is probably off by less than a cell: a search there is cheaper.
     """
-    if not within_reason(start):
+    if not has_converged(start):
         return None
     found = _seek_within(image, camera, model, start, NEAR_REACH) if near else None
     return found or _seek_within(image, camera, model, start, SEARCH_REACH)
@@ -307,7 +307,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
     if math.hypot(*step[10:12].tolist()) > _MAX_FALL_OFF * response[0]:
         return None
     rows = at.design[6:12]
-    return _checked(model, SmearStart(pose, smear, lens), _Descent(
+    return _check_fit(model, SmearStart(pose, smear, lens), _Descent(
         residual, step[6:12].dot(rows), weights, information, response[0], rows))
 
 
@@ -386,7 +386,7 @@ def _by_pose(basis: Array, places: Array, center: Array, right: Array, down: Arr
     design[5] = arm_x * y - arm_y * x
 
 
-def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | None:
+def _check_fit(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | None:
     """Return a fit, None if it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual

@@ -46,22 +46,31 @@ from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.ranges import MAX_OFFSET
 
 #: Initial standard deviation of an offset, s.
-PRIOR: Final[float] = 0.1
-#: Step and half width of the grid of offsets about the initial one, s.
-STEP, FURTHEST = 0.01, 0.14
-GRID: Final[Array] = np.arange(-FURTHEST, FURTHEST + 0.5 * STEP, STEP)
-#: Least length of a batch, s; least number of its points, and the most in that time.
+INITIAL_DEVIATION: Final[float] = 0.1
+#: Step of the grid of offsets, s.
+GRID_STEP = 0.01
+#: Half width of the grid of offsets, s.
+GRID_REACH = 0.14
+#: Offsets about the initial one, s.
+OFFSET_GRID: Final[Array] = np.arange(-GRID_REACH, GRID_REACH + 0.5 * GRID_STEP, GRID_STEP)
+#: Least length of a batch, s.
 BATCH: Final[float] = 0.6
-FEWEST, MOST_POINTS = 8, 40
-#: Noise of a point, m, and spectral density of the jerk, (m/s^3)^2/Hz: their ratio counts.
-NOISE, JERK = 0.0015, 0.5
+#: Least number of points of a batch.
+MIN_POINTS = 8
+#: Most points in the length of a batch.
+MAX_POINTS = 40
+#: Noise of a point, m: only its ratio to JERK counts.
+NOISE = 0.0015
+#: Spectral density of the jerk, (m/s^3)^2/Hz.
+JERK = 0.5
 #: Deviations are widened: errors of successive images are alike.
 WIDENING: Final[float] = 2.0
 #: An estimate is applied once it differs from the applied offset by this many deviations, at first
-#: and later, and by this much, s.
+#: and later, and by MIN_CHANGE.
 SIGNIFICANT: Final = (4.0, 1.5)
-LEAST: Final[float] = 0.001
-#: Pause after a batch, s, while the deviation is below LEAST.
+#: Least change of the applied offset, s.
+MIN_CHANGE: Final[float] = 0.001
+#: Pause after a batch, s, while the deviation is below MIN_CHANGE.
 REST: Final[float] = 3.0
 #: Number of batches that are used: clocks drift.
 REMEMBERED: Final[float] = 60.0
@@ -82,9 +91,9 @@ class TimeOffset:
     def restart(self) -> None:
         """Reset the estimate."""
         self.applied = self.estimate = self._first
-        self.deviation = PRIOR
+        self.deviation = INITIAL_DEVIATION
         """Standard deviation of the estimate, s."""
-        self._misfits: Array = np.zeros(len(GRID))
+        self._misfits: Array = np.zeros(len(OFFSET_GRID))
         self._freedom = 0.0
         self._found = False
         self._resting = -math.inf  # until this time, s
@@ -110,22 +119,22 @@ class TimeOffset:
         path = self._paths.setdefault(name, [])
         if path and not 0.0 < time - path[-1][0] < 0.5 * BATCH:
             path.clear()
-        if not path or time - path[-1][0] > 0.9 * BATCH / MOST_POINTS:
+        if not path or time - path[-1][0] > 0.9 * BATCH / MAX_POINTS:
             path.append((time, T_body_camera.apply(camera_point)))
-        last = (odometry.newest or time) - self._first - FURTHEST
+        last = (odometry.newest or time) - self._first - GRID_REACH
         if path[0][0] + BATCH > last:
             return 0.0
         usable = [each for each in path if each[0] <= last]
-        if len(usable) < FEWEST or usable[-1][0] - usable[0][0] < BATCH:
+        if len(usable) < MIN_POINTS or usable[-1][0] - usable[0][0] < BATCH:
             return 0.0
         del path[:len(usable)]
-        self._resting = time + (REST if self.deviation < LEAST else 0.0)
+        self._resting = time + (REST if self.deviation < MIN_CHANGE else 0.0)
         self._judge(np.array([t for t, _ in usable]), np.array([p for _, p in usable]), odometry)
         return self._apply()
 
     def _judge(self, times: Array, points: Array, odometry: OdometryBuffer) -> None:
         """Take the points (n, 3) of a batch, in base_link, at n times, s."""
-        places = odometry.places(times + (self._first + GRID)[:, None], points)
+        places = odometry.places(times + (self._first + OFFSET_GRID)[:, None], points)
         if places is None:
             return
         precision = _precision(times - times[0])
@@ -135,24 +144,25 @@ class TimeOffset:
         keep = 1.0 - 1.0 / REMEMBERED
         self._misfits = keep * self._misfits + misfits
         self._freedom = keep * self._freedom + 3.0 * (len(times) - 3)
-        chi2 = self._misfits * (self._freedom / self._misfits.min()) + (GRID / PRIOR)**2
+        chi2 = self._misfits * (self._freedom / self._misfits.min()) + (
+            OFFSET_GRID / INITIAL_DEVIATION)**2
         best = int(chi2.argmin())
         weights = np.exp(0.5 * (chi2[best] - chi2))
-        spread = float(weights.dot((GRID - GRID[best])**2) / weights.sum())
-        if 0 < best < len(GRID) - 1:
+        spread = float(weights.dot((OFFSET_GRID - OFFSET_GRID[best])**2) / weights.sum())
+        if 0 < best < len(OFFSET_GRID) - 1:
             before, least, after = chi2[best - 1:best + 2].tolist()
             bend = before - 2.0 * least + after
-            shift = 0.5 * STEP * (before - after) / bend
-            spread = max(2.0 * STEP**2 / bend, spread - STEP**2)
+            shift = 0.5 * GRID_STEP * (before - after) / bend
+            spread = max(2.0 * GRID_STEP**2 / bend, spread - GRID_STEP**2)
         else:
-            shift, spread = 0.0, PRIOR**2
-        self.estimate = self._first + float(GRID[best]) + shift
+            shift, spread = 0.0, INITIAL_DEVIATION**2
+        self.estimate = self._first + float(OFFSET_GRID[best]) + shift
         self.deviation = WIDENING * math.sqrt(spread)
 
     def _apply(self) -> float:
         """Apply the estimate if it is significant; return by how much the applied one changed."""
         off = abs(self.estimate - self.applied)
-        if not off > max(LEAST, SIGNIFICANT[self._found] * self.deviation):
+        if not off > max(MIN_CHANGE, SIGNIFICANT[self._found] * self.deviation):
             return 0.0
         before, self._found = self.applied, True
         self.applied = min(max(self.estimate, -MAX_OFFSET), MAX_OFFSET)

@@ -74,7 +74,7 @@ from flock_follower.perception.range_tracking import Ranging, RangingParams
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 
 #: The mirrored attitude is fitted in every image while its chi^2 is within this of the other's.
-MARGIN = 100.0
+SETTLED_MARGIN = 100.0
 #: Images from one fit of the mirrored attitude to the next, otherwise.
 MIRRORED_EVERY = 30
 #: Images from one fit of the mirrored attitude of a smeared print to the next.
@@ -337,7 +337,7 @@ class Tracker:
         """Return in how many images the mirrored attitude need not be looked at again."""
         assert found.margin is not None
         if found.spacing is not None:
-            return MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
+            return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
         settled = found.doubt < SETTLED and expected.pose is not None and (
             angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
         return SMEARED_EVERY - 1 if settled else 0
@@ -385,7 +385,7 @@ class Tracker:
                 rounds, number = divmod(camera.portion, search.N_PORTIONS)
                 self._locate(search.portion(
                     image, dictionary, markers, number, prints.border_sought(rounds) if unseen
-                    else prints.BORDERS[0]), 'full', image, look)
+                    else prints.BORDER_WIDTHS[0]), 'full', image, look)
                 camera.portion += 1
         look.sighting.stage, camera.searched = 'full', look.stamp
 

@@ -34,7 +34,7 @@ from flock_follower.perception.innovation import ALIKE_TIME
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
-    GATE,
+    GATE_CHI2,
     NeighborFilter,
     UpdateOutcome,
 )
@@ -174,7 +174,7 @@ def surprising(off: float) -> tuple[NeighborFilter, float, Array]:
     """Return a filter that was surprised, the time, and by how much, so many times the gate."""
     tracker, t = tracked(1.0), 1.0 + DT
     spread = now(tracker, t).covariance[:3, :3] + NOISE[:3, :3]
-    way = np.array([0.0, np.sqrt(off * GATE * spread[1, 1]), 0.0])
+    way = np.array([0.0, np.sqrt(off * GATE_CHI2 * spread[1, 1]), 0.0])
     assert update(tracker, t, moved(truth(t), *way)) is UpdateOutcome.SURPRISING
     return tracker, t, way
 

@@ -38,7 +38,12 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import reported
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams
-from flock_follower.perception.tracker import camera_mounting, MARGIN, MIRRORED_EVERY, Tracker
+from flock_follower.perception.tracker import (
+    camera_mounting,
+    MIRRORED_EVERY,
+    SETTLED_MARGIN,
+    Tracker,
+)
 
 CAMERA = make_camera()
 MOUNTING = camera_mounting([0.10, 0.0, 0.02], [0.0, 0.1, 0.0])  # looking 6 deg down
@@ -193,7 +198,7 @@ def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
         found, check = track(*arguments), arguments[5]
         if arguments[3].pose is not None:
             done.append(check)
-        return found and found._replace(margin=MARGIN + 1.0 if check else None)
+        return found and found._replace(margin=SETTLED_MARGIN + 1.0 if check else None)
 
     monkeypatch.setattr(tracker_module, 'track', watched)
     for _ in range(2 * MIRRORED_EVERY + 2):
