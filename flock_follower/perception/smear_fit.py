@@ -69,9 +69,9 @@ _MIN_FIT_LIKENESS = 0.95
 #: Least difference of white and black, gray levels.
 _MIN_CONTRAST = 10.0
 #: Most steps of a descent.
-_MAX_PASSES = 12
+_MAX_PASSES = 10
 #: First steps, in which that of the smear is halved.
-_DAMPED_PASSES = 3
+_DAMPED_PASSES = 2
 #: A step that turns by less, rad, may be the last.
 _LAST_TURN = 0.02
 #: A step of pose and smear that is shorter, cells, may be the last.
