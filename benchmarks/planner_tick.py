@@ -50,7 +50,7 @@ from flock_follower.geometry import Array
 from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import Edges, GuardParams, PlannerParams
-from flock_follower.planner.projection import Discs, lexicographic, optimum, Side
+from flock_follower.planner.projection import Discs, nearest_in_order, optimum, Side
 from flock_follower.planner.step import Memory, step
 
 #: Numbers of neighbors: how many times the bare law a tick may take, by 99th percentiles.
@@ -165,7 +165,7 @@ def contest(count: int, problems: int, solvers: dict[str, Solve]) -> None:
     """Print what each method takes for the same problems, which take turns."""
     rng = np.random.default_rng(count)
     drawn = [problem(count, rng) for _ in range(problems)]
-    methods: dict[str, Callable[..., Any]] = {'ours': lexicographic}
+    methods: dict[str, Callable[..., Any]] = {'ours': nearest_in_order}
     if (reference := exhaustive()) is not None:
         methods['all candidates'] = reference
     room = np.array([optimum(p.wanted, False, p.bounds, p.discs)[1] == len(p.bounds)
@@ -210,7 +210,7 @@ def pair(number: complex) -> Array:
 def on_polygons(p: Problem) -> Array:
     """Return our answer with polygons in place of the discs."""
     sides = [(complex(*normal), float(least)) for normal, least in zip(*polygons(p.discs))]
-    return pair(lexicographic(p.wanted, [*sides, *p.bounds], Discs(0j, WIDE, 0j, WIDE)))
+    return pair(nearest_in_order(p.wanted, [*sides, *p.bounds], Discs(0j, WIDE, 0j, WIDE)))
 
 
 def in_order(solve: Solve, p: Problem) -> tuple[Array, int]:
@@ -254,7 +254,7 @@ def exhaustive() -> Callable[..., Any] | None:
         print(f'\nall candidates: not measured ({error})')
         return None
 
-    found: Callable[..., Any] = exhaustive_projection.lexicographic
+    found: Callable[..., Any] = exhaustive_projection.nearest_in_order
     return found
 
 

@@ -63,12 +63,12 @@ from flock_follower.ranges import Range
 from flock_follower.topic_names import parse_remaps
 from flock_follower.whole_file import whole_file
 
-SECONDS = 6.0
+LISTENING_TIME = 6.0  # s
 VALID_SECONDS = Range(1.0, 600.0, 's')
 COLUMNS = 100
-#: Larger files of a recording are left out of a bug report, bytes; the black box writes none.
 TOO_BUSY: Final = 3  # exit code
-LARGEST: Final = 200_000_000
+#: A larger file of a recording is left out of a bug report, bytes; the black box writes none.
+MAX_RECORDING_SIZE: Final = 200_000_000
 _MARKS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR', UNMEASURED: '?'}
 
 
@@ -88,7 +88,7 @@ def main(args: Sequence[str] | None = None) -> int:
                         'may be repeated')
     parser.add_argument('--camera', default='', metavar='NAME', help='of several cameras the one '
                         'to check (default: the first)')
-    parser.add_argument('--seconds', type=float, default=SECONDS,
+    parser.add_argument('--seconds', type=float, default=LISTENING_TIME,
                         help='how long to listen (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
     parser.add_argument('--report', type=Path, metavar='FILE', help='also write a zip file for a '
@@ -208,7 +208,7 @@ def write_report(path: Path, seen: Observations, findings: Sequence[Finding],
                     node: asdict(status) for node, status in seen.statuses.items()})):
             archive.writestr(name, json.dumps(content, indent=1, default=str))
         for each in _files(recording) if recording else ():
-            if each.stat().st_size <= LARGEST:
+            if each.stat().st_size <= MAX_RECORDING_SIZE:
                 archive.write(each, f'recording/{each.name}')
 
 

@@ -52,8 +52,8 @@ def profile_variables(relative: str) -> dict[str, str]:
     return dict.fromkeys(PROFILE_VARIABLES, str(resource(relative)))
 
 
-def open_shared_memory() -> list[str]:
-    """Return the names of the files of shared memory that this process has open."""
+def opened_segment_names() -> list[str]:
+    """Return the names of the shared-memory files that this process has open."""
     opened = []
     for link in Path('/proc/self/fd').glob('*'):
         with contextlib.suppress(OSError):  # closed meanwhile by another thread
@@ -62,9 +62,9 @@ def open_shared_memory() -> list[str]:
 
 
 def largest_shared_memory() -> int:
-    """Return the size, bytes, of the largest file that this process has open; or 0."""
+    """Return the size, bytes, of the largest shared-memory file that is open; else 0."""
     sizes = [0]
-    for name in open_shared_memory():
+    for name in opened_segment_names():
         with contextlib.suppress(OSError):  # removed
             sizes.append(Path(name.removesuffix(_LOCK_SUFFIX)).stat().st_size)
     return max(sizes)

@@ -32,7 +32,7 @@ import re
 import sys
 
 from flock_follower.bridge_state import FLYING, read_flag
-from flock_follower.check import SECONDS, table
+from flock_follower.check import LISTENING_TIME, table
 from flock_follower.checks.findings import ready
 from flock_follower.checks.recorded_system import judge_all
 
@@ -57,7 +57,7 @@ def main(args: Sequence[str] | None = None) -> int:
               'package in package.xml', file=sys.stderr)
         return 2
     try:
-        seen = observe(SECONDS, options.namespace, {}, '')
+        seen = observe(LISTENING_TIME, options.namespace, {}, '')
     except KeyboardInterrupt:
         return 130
     findings = judge_all(seen)

@@ -120,7 +120,7 @@ class PoseSource:
 
 @dataclass(frozen=True, eq=False)
 class MarkedNeighbor:
-    """One neighbor, and the markers mounted rigidly on it; none if it has a ``source``."""
+    """One neighbor and the markers on its body: without markers if it has a ``source``."""
 
     name: str
     markers: tuple[Marker, ...]

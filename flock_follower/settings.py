@@ -60,7 +60,7 @@ class Camera(NamedTuple):
 
 
 class Judgment(NamedTuple):
-    """One parameter that cannot fly, or flies badly, beside the others."""
+    """One parameter whose value is dangerous, or flies badly, with those of the others."""
 
     dangerous: bool
     parameter: str
@@ -78,9 +78,9 @@ class Judgment(NamedTuple):
 UNKNOWN: Final[Camera] = Camera()
 
 
-def judge(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> list[Judgment]:
+def find_unsafe_settings(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> list[Judgment]:
     """
-    Return everything that a set of parameters cannot fly, or flies badly; the dangers first.
+    Return the settings that are dangerous or fly badly, the dangerous ones first.
 
     :param values: of one node or of several, by name; a rule about a missing one is left out.
     """
@@ -95,7 +95,7 @@ def refuse(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> None:
 
     :raises ValueError: naming the parameter, its value and the nearest value that flies.
     """
-    for each in judge(values, camera):
+    for each in find_unsafe_settings(values, camera):
         if each.dangerous:
             raise ValueError(str(each))
 

@@ -28,7 +28,14 @@ from flock_follower.parameters.spec import specs_of
 from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import A_MAX, V_MAX
-from flock_follower.settings import Camera, judge, NARROWEST, NEAREST, refuse, UNKNOWN
+from flock_follower.settings import (
+    Camera,
+    find_unsafe_settings,
+    NARROWEST,
+    NEAREST,
+    refuse,
+    UNKNOWN,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULTS = {spec.name: spec.default for spec in (*specs_of(PlannerParams()),
@@ -39,7 +46,8 @@ USUAL = Camera(30.0, 610.0 * 0.16, 0.37)
 
 def found(camera=USUAL, **changes):
     """Return parameter and danger of each judgment of the defaults with some changes."""
-    return [(each.parameter, each.dangerous) for each in judge(DEFAULTS | changes, camera)]
+    return [(each.parameter, each.dangerous)
+            for each in find_unsafe_settings(DEFAULTS | changes, camera)]
 
 
 def test_the_defaults_can_fly():
@@ -56,7 +64,7 @@ def test_the_recommendation_for_first_flights_can_fly():
                          ids=lambda path: path.stem)
 def test_every_scenario_can_fly(path):
     flight = load(str(path)).flight
-    assert not [each for each in judge(asdict(flight), USUAL) if each.dangerous]
+    assert not [each for each in find_unsafe_settings(asdict(flight), USUAL) if each.dangerous]
 
 
 @pytest.mark.parametrize(('changes', 'camera', 'expected'), [
@@ -82,7 +90,7 @@ def test_what_cannot_fly_is_named(changes, camera, expected):
 def test_the_value_that_a_refusal_names_is_accepted(a_max, v_max, d0, d1):
     values = DEFAULTS | {'a_max': a_max, 'v_max': v_max, 'd0': d0, 'd1': max(d1, d0)}
     for _ in range(4):
-        dangers = [each for each in judge(values) if each.dangerous]
+        dangers = [each for each in find_unsafe_settings(values) if each.dangerous]
         if not dangers:
             break
         named = dangers[0]

@@ -240,7 +240,7 @@ class FlightController(ABC):
         return ACCEPTED
 
     def pilot_switches(self, name: str) -> None:
-        """Change the mode by remote control, which no check prevents."""
+        """Change the mode as the pilot's remote control does. No check prevents it."""
         self._enter(name)
         self.in_failsafe = False
 

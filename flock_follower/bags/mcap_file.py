@@ -138,9 +138,9 @@ class McapFile:
         places, index = bytearray(), bytearray()
         for channel, entry in entries.items():
             places += struct.pack('<HQ', channel, self.size + len(chunk) + len(index))
-            index += _record(_OP_MESSAGE_INDEX, struct.pack('<H', channel), _with_size(entry))
+            index += _record(_OP_MESSAGE_INDEX, struct.pack('<H', channel), _prefix_size(entry))
         chunk_index = _record(
-            _OP_CHUNK_INDEX, span, struct.pack('<QQ', self.size, len(chunk)), _with_size(places),
+            _OP_CHUNK_INDEX, span, struct.pack('<QQ', self.size, len(chunk)), _prefix_size(places),
             struct.pack('<Q', len(index)), _text(''), size, size)
         self._append(chunk + index)
         self._summary[_OP_CHUNK_INDEX].append(chunk_index)
@@ -180,8 +180,9 @@ class McapFile:
         for kind, record in (
                 (_OP_SCHEMA, _record(_OP_SCHEMA, struct.pack('<H', number), _text(topic.msgtype),
                                      _text('ros2msg'), _text(definition(topic.msgtype)))),
-                (_OP_CHANNEL, _record(_OP_CHANNEL, struct.pack('<HH', number, number),
-                                      _text(topic.name), _text('cdr'), _with_size(qos + source)))):
+                (_OP_CHANNEL, _record(
+                    _OP_CHANNEL, struct.pack('<HH', number, number), _text(topic.name),
+                    _text('cdr'), _prefix_size(qos + source)))):
             self._summary[kind].append(record)
             content += record
         return number
@@ -195,7 +196,7 @@ class McapFile:
             _OP_STATISTICS, struct.pack(
                 '<QHIIIIQQ', self.counts.total(), len(self._channels), len(self._channels), 0, 0,
                 len(self._summary[_OP_CHUNK_INDEX]), self.start_ns, self.end_ns),
-            _with_size(counts))
+            _prefix_size(counts))
         summary = b''.join(record for records in self._summary.values() for record in records)
         footer = _record(_OP_FOOTER, struct.pack('<QQI', start, 0, 0))
         return end + summary + statistics + footer + MCAP_MAGIC
@@ -205,12 +206,12 @@ def _record(kind: int, *parts: bytes | bytearray) -> bytes:
     return b''.join((struct.pack('<BQ', kind, sum(map(len, parts))), *parts))
 
 
-def _with_size(data: bytes | bytearray) -> bytes:
+def _prefix_size(data: bytes | bytearray) -> bytes:
     return struct.pack('<I', len(data)) + data
 
 
 def _text(text: str) -> bytes:
-    return _with_size(text.encode())
+    return _prefix_size(text.encode())
 
 
 @cache

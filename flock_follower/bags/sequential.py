@@ -204,7 +204,7 @@ def _connection(number: int, channel: _Channel, count: int) -> Connection:
 
 
 def _profiles(qos: str) -> list[Qos]:
-    """Return QoS profiles; none if they are written in a way that is not understood."""
+    """Return the QoS profiles; an empty list if the text cannot be parsed."""
     try:
         return parse_qos(qos)
     except Exception:  # the recorder's text: anything can be wrong, and no message depends on it

@@ -64,7 +64,7 @@ class Finding(NamedTuple):
         return f'{line}; do: {self.advice}' if self.advice else line
 
 
-def judged(bad: bool, poor: bool, what: str, measured: str, wanted: str,
+def grade(bad: bool, poor: bool, what: str, measured: str, wanted: str,
            advice: str) -> Finding:
     """Return an error if ``bad``, a warning if only ``poor``, else OK without the advice."""
     if bad or poor:

@@ -22,7 +22,7 @@ import math
 from flock_follower.checks.findings import ERROR, Finding, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.pictures import camera_model
-from flock_follower.settings import Camera, judge
+from flock_follower.settings import Camera, find_unsafe_settings
 
 #: Messages after which a rate counts as measured.
 MEASURED_MESSAGES = 10
@@ -40,7 +40,7 @@ def check_settings(seen: Observations) -> Iterator[Finding]:
               for name, value in seen.parameters.get(node, {}).items()}
     if not values:
         return
-    found = judge(values, _camera(seen))
+    found = find_unsafe_settings(values, _camera(seen))
     for each in found:
         yield Finding(ERROR if each.dangerous else WARNING, 'settings',
                       f'{each.parameter} = {each.value:g}: {each.why}', each.valid,

@@ -207,7 +207,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     best = 0 if shares[:, 0].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
     R, curve = to_optical[best], shares[:, best]
     for _ in range(2):  # an error of the mounting looks like an offset, too
-        offset = _summit(offsets, curve)
+        offset = _parabola_peak(offsets, curve)
         turned, known = _base_rotations(rows, path, offset)
         moved = np.diff(known[:, :2]) * path.motion(known[:, :2].mean(axis=1) - offset)[1]
         solution, covariance = _fit_mounting(
@@ -288,7 +288,7 @@ def _shares(moves: Sequence[tuple[Array, Array]], R_base_optical: Array) -> Arra
     return shares
 
 
-def _summit(offsets: Array, curve: Array) -> float:
+def _parabola_peak(offsets: Array, curve: Array) -> float:
     """Return the maximum of the parabola through the three points about the peak."""
     peak = min(max(int(curve.argmax()), 1), len(curve) - 2)
     before, top, after = curve[peak - 1:peak + 2].tolist()

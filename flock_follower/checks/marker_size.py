@@ -19,9 +19,9 @@ By odometry and image the marker must stay in place. If it approaches by more, o
 camera moves towards it, its size (or the focal length) is wrong. Both are taken along the mean
 line of sight, where an error of the mounting has no effect of first order.
 
-A leader that moves can look the same: if it goes ahead by half of the follower's way, it looks
-like a marker whose configured size is too small. So a ratio counts only if it explains nearly all
-changes of the distance.
+A moving leader can cause the same symptom. If the leader moves away by half the distance that the
+follower flies, the configured marker size seems too small. So a ratio counts only if it explains
+nearly all changes of the distance.
 """
 
 from __future__ import annotations

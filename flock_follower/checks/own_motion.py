@@ -27,7 +27,7 @@ from flock_follower.checks.findings import (
     ERROR,
     Finding,
     first,
-    judged,
+    grade,
     OK,
     SIGNIFICANT_SIGMAS,
     UNMEASURED,
@@ -106,7 +106,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
         return
     count = motion.lost + len(motion.states)
     if motion.lost:
-        yield judged(motion.lost > LOST * count, True, 'odom',
+        yield grade(motion.lost > LOST * count, True, 'odom',
                      f'{motion.lost} of {count} are invalid: {motion.last_error}',
                      'position and attitude', 'wait until its source is initialized; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
@@ -284,7 +284,7 @@ def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
         return Finding(UNMEASURED, what, 'a fisheye lens' if fisheye else
                        'turned too little: pitch and yaw it by hand', wanted)
     wrong = abs(math.log(max(fit.zoom, 1e-3))) > max(ZOOM, SIGNIFICANT_SIGMAS * fit.zoom_deviation)
-    return judged(
+    return grade(
         wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
         wanted, 'is the calibration of this lens, and for this size of images?')
 

@@ -72,7 +72,7 @@ class Load(NamedTuple):
 
 
 def threads_of(process: int, proc: Path = PROC) -> dict[Path, tuple[int, int]]:
-    """Return ns run and ns waited of each thread of a process; none if it has ended."""
+    """Return ns run and ns waited of each thread; empty if the process has ended."""
     found = {}
     for path in proc.glob(f'{process}/task/*/schedstat'):
         with contextlib.suppress(OSError, ValueError, IndexError):  # it has ended meanwhile

@@ -36,7 +36,7 @@ from flock_follower.checks.findings import (
     ERROR,
     Finding,
     first,
-    judged,
+    grade,
     OK,
     UNMEASURED,
     WARNING,
@@ -78,7 +78,7 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
     machine = seen.machine
     load, wanted = machine.load, f'at most {BUSY_SHARE:.0%}, never {STARVED_SHARE:.0%}'
     if load is not None:
-        yield judged(load.share > STARVED_SHARE, load.busy, 'processor', str(load), wanted,
+        yield grade(load.share > STARVED_SHARE, load.busy, 'processor', str(load), wanted,
                      'end programs that are not needed (rviz, recordings), or reduce the load of '
                      'the odometry')
     elif seen.live:
@@ -121,7 +121,7 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
             continue
         advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
-        found = [judged(status.level > 1, status.level == 1, f'{node} status', status.message,
+        found = [grade(status.level > 1, status.level == 1, f'{node} status', status.message,
                         'running', advice)]
         if node == 'mavlink_bridge':
             found += _autopilot(status.values)
@@ -172,7 +172,7 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
             ('ready for offboard', REFUSED, 'fix the reported cause: the bridge would refuse '
              'offboard')):
         if key in values:
-            yield judged(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
+            yield grade(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
                          wanted, wanted, advice)
         elif key == REFUSED or not read_flag(values, ARMED):
             yield Finding(UNMEASURED, what, 'not reported yet', wanted)

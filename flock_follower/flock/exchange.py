@@ -40,7 +40,7 @@ from flock_follower.flock.peers import (
     age_covariances,
     checked_name,
     FRAME,
-    FUTURE,
+    FROM_FUTURE,
     in_order,
     is_covariance,
     leapt,
@@ -190,7 +190,7 @@ class Sharing:
                      name == self.name):
             return
         if refused := refusal(state, received):
-            if refused[0] == FUTURE and sender is not None:
+            if refused[0] == FROM_FUTURE and sender is not None:
                 sender.ban = received + BAN_TIME, 'has a clock that is ahead'
             self._refuse(*refused)
         elif not self._refuse_first((sender is None and len(self._senders) >= MAX_SENDERS,

@@ -82,7 +82,7 @@ def is_covariance(matrix: Array) -> bool:
 
 
 #: Refusal after which a sender is ignored for a while: all its stamps are wrong.
-FUTURE = 'message from the future'
+FROM_FUTURE = 'message from the future'
 
 
 def refusal(state: OdometryState, received: int) -> tuple[str, str] | None:
@@ -93,7 +93,7 @@ def refusal(state: OdometryState, received: int) -> tuple[str, str] | None:
     return next(((reason, f'{sender}: {detail}') for holds, reason, detail in (
         (not NAME.fullmatch(state.child), 'message of an unnamed vehicle', repr(state.child[:70])),
         (fast, 'message not finite, or too fast', fast),
-        (age < -CLOCK_TOLERANCE, FUTURE, f'its clock is ahead by {-age:.3f} s or more'),
+        (age < -CLOCK_TOLERANCE, FROM_FUTURE, f'its clock is ahead by {-age:.3f} s or more'),
         (age > MESSAGE_AGE_MAX, 'message too old',
          f'{age:.2f} s: its clock is behind, or the way is slow'),
         (not known, 'message without a covariance', state.child)) if holds), None)

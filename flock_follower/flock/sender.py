@@ -31,7 +31,7 @@ BAN_TIME = 5 * NANOSECONDS  # ns for which a sender whose stamps are wrong is ig
 # One sender sends at 10 Hz: more own states in a time come from two senders.
 BURST_COUNT = 20  # own states of two senders
 BURST_TIME = 1_400_000_000  # ns in which two senders send so many
-MAX_AGES = 50  # messages whose ages are kept
+N_AGES = 50  # messages whose ages are kept
 SLOW_LINK = 0.25  # s: the least age that is reported
 
 
@@ -57,7 +57,7 @@ class Sender:
     """Relations refused in a row."""
     received: int = 0
     """When its last message was received, ns."""
-    ages: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_AGES))
+    ages: deque[float] = field(default_factory=lambda: deque(maxlen=N_AGES))
     """Ages of its last messages on reception, s."""
     sent: deque[int] = field(default_factory=lambda: deque(maxlen=BURST_COUNT))
     """Stamps of the last states of itself, ns."""

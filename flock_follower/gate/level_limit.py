@@ -21,7 +21,7 @@ import math
 
 from flock_follower.geometry import Array
 from flock_follower.planner.limits import INSIDE_SHARE, limit_command, SENT_INSIDE
-from flock_follower.planner.projection import Discs, lexicographic, Side
+from flock_follower.planner.projection import Discs, nearest_in_order, Side
 
 
 def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: float, v_max: float,
@@ -39,5 +39,5 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     up = min(max(up, side.best(-1 + 0j, far=True).real), side.best(1 + 0j, far=True).real)
     level = Discs(0j, math.sqrt(max(strongest ** 2 - up ** 2, 0.0)), complex(*center[:2]),
                   math.sqrt(max(reach ** 2 - (up - center[2]) ** 2, 0.0)))
-    point = lexicographic(complex(*a[:2].tolist()), sides, level)
+    point = nearest_in_order(complex(*a[:2].tolist()), sides, level)
     return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration

@@ -43,7 +43,7 @@ from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.link_questions import NO_ANSWER, REASONS
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.parameter_watch import ParameterWatch
-from flock_follower.mavlink.sticks import take_over_slowly
+from flock_follower.mavlink.sticks import needs_stick_handover
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 from flock_follower.messages import to_nanoseconds
 
@@ -241,7 +241,7 @@ class Housekeeping:
 
     def watches_sticks(self) -> bool:
         """Return whether the bridge hands over if the pilot moves a stick."""
-        return take_over_slowly(self._link.telemetry.dialect, self.parameters)
+        return needs_stick_handover(self._link.telemetry.dialect, self.parameters)
 
     def request_reasons(self) -> None:
         """Request the autopilot's reasons for its last refusal."""

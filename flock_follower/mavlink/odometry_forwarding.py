@@ -179,11 +179,14 @@ def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_c
     x, y, z, w = quaternion_enu_flu_to_ned_frd(state.quaternion).tolist()
     # The covariance of R x is R C R^T.
     pose_covariance = _transform(
-        _valid(state.pose_covariance, [position_std] * 3 + [attitude_std] * 3), _R_NED_ENU)
+        _covariance_or_default(state.pose_covariance, [position_std] * 3 + [attitude_std] * 3),
+        _R_NED_ENU)
     twist_covariance: Array = np.zeros((6, 6))
     twist_covariance[:3, :3] = (
-        R_enu_flu.T @ _valid(state.velocity_covariance, [velocity_std] * 3) @ R_enu_flu)
-    twist_covariance[3:, 3:] = _valid(state.twist_covariance[3:, 3:], [rate_std] * 3)
+        R_enu_flu.T @ _covariance_or_default(state.velocity_covariance, [velocity_std] * 3)
+        @ R_enu_flu)
+    twist_covariance[3:, 3:] = _covariance_or_default(
+        state.twist_covariance[3:, 3:], [rate_std] * 3)
     twist_covariance = _transform(twist_covariance, _R_FRD_FLU)
     return mavlink.MAVLink_odometry_message(
         max(0, round(time * 1e6)), dialect.odometry_frame, mavlink.MAV_FRAME_BODY_FRD,
@@ -194,8 +197,8 @@ def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_c
         reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO, quality(state, age))
 
 
-def _valid(covariance: Array, deviations: list[float]) -> Array:
-    """Return the covariance, or a diagonal of the deviations if it is invalid."""
+def _covariance_or_default(covariance: Array, deviations: list[float]) -> Array:
+    """Return the covariance; if it is invalid, a diagonal one with the deviations."""
     return covariance if _is_known(covariance) else np.diag(np.square(deviations))
 
 

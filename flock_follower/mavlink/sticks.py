@@ -59,8 +59,8 @@ class Sticks(NamedTuple):
     throttle: float
 
 
-def take_over_slowly(dialect: Dialect | None, parameters: ParameterCheck) -> bool:
-    """Return whether a slow stick does not take over by itself, so that the bridge hands over."""
+def needs_stick_handover(dialect: Dialect | None, parameters: ParameterCheck) -> bool:
+    """Return whether the bridge must hand over: the autopilot ignores a slowly moved stick."""
     version = parameters.version
     if dialect is None or not dialect.stick_speed:
         return False

@@ -72,7 +72,7 @@ from flock_follower.planner.parameter_table import PLANNER as SPECS
 from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
-from flock_follower.settings import judge
+from flock_follower.settings import find_unsafe_settings
 
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node reports it
 FLOWN_TIME = 60.0  # s after the last flying tick in which a change of the bridge is reported
@@ -86,7 +86,7 @@ class Planner(FlockNode):
         self._start: PlannerParams | None = None
         self._settings = self.declare(SPECS, self._build, self._flying)
         values = self._settings.values
-        for judgment in judge(values):
+        for judgment in find_unsafe_settings(values):
             self.get_logger().warning(str(judgment))
         self._loop = PlannerLoop(values['require_bridge'])
         self._bridge: BridgeState | None = None

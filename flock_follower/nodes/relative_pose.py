@@ -181,7 +181,8 @@ class RelativePose(FlockNode):
         if self._perceiver.take_camera_info(message, camera.name):
             model = self._perceiver.model(camera.name)
             assert model is not None
-            key, size = _key('camera', camera.name), f'{model.width}x{model.height} {model.model}'
+            key = _diagnostics_key('camera', camera.name)
+            size = f'{model.width}x{model.height} {model.model}'
             self.diagnostics.values[key] = size
             self.get_logger().info(f'{key}: {size}')
             self._process_pending()
@@ -328,9 +329,10 @@ class RelativePose(FlockNode):
         values: dict[str, object] = {'images_processed': self.diagnostics.rate('processed').count}
         for name, camera in self._tracker.cameras.items():
             values |= {
-                _key('time_offset', name): camera.time_offset.describe,
-                _key('attitude_noise_rad', name): f'{camera.noise.attitude:.5f}',
-                _key('distance_noise_percent', name): f'{100.0 * camera.noise.distance:.2f}'}
+                _diagnostics_key('time_offset', name): camera.time_offset.describe,
+                _diagnostics_key('attitude_noise_rad', name): f'{camera.noise.attitude:.5f}',
+                _diagnostics_key('distance_noise_percent', name):
+                    f'{100.0 * camera.noise.distance:.2f}'}
         for name, bias in self._tracker.ranging.biases.items():
             values |= {f'range_bias_{name}_m': f'{bias.value:.3f}',
                        f'range_outliers_{name}_percent': f'{100.0 * bias.gate.outliers:.1f}'}
@@ -362,8 +364,12 @@ class RelativePose(FlockNode):
         return None
 
 
-def _key(value: str, camera: str) -> str:
-    """Return the key of a value of a camera; a single camera has no name."""
+def _diagnostics_key(value: str, camera: str) -> str:
+    """
+    Return the diagnostics key of a value.
+
+    It ends with the camera's name if there are several cameras.
+    """
     return f'{value} {camera}' if camera else value
 
 

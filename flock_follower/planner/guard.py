@@ -197,12 +197,14 @@ def _longest_retreat(approach: float, params: PlannerParams, known: float = math
         coming * min(YIELD_TIME * approach, YIELD_MAX))
 
 
-def retreat_velocity(memory: Memory, scene: Scene, params: PlannerParams) -> Array | None:
+def fallback_retreat_velocity(memory: Memory, scene: Scene,
+                              params: PlannerParams) -> Array | None:
     """
-    Return the velocity (3,), m/s, that keeps the distance to a neighbor that comes, or None.
+    Return the velocity (3,), m/s, that keeps the distance to an approaching neighbor, or None.
 
-    The gate brakes to it if odometry is lost. Of several that come the nearest counts. As out of
-    sight, a neighbor also comes if it will in TRUSTED_TIME, and the retreat has a limit.
+    The gate brakes to it if odometry is lost. Of several approaching neighbors the nearest counts.
+    As out of sight, a neighbor that will approach in TRUSTED_TIME counts, too, and the retreat has
+    a limit.
     """
     if not params.guard or params.retreat_max == 0.0:
         return None

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
-from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, lexicographic, product
+from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, nearest_in_order, product
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in
 # a caller's check, cannot exceed it; a limited vector thus passes a second time unchanged.
@@ -247,7 +247,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     firm = [bounds[k] for k in range(len(bounds)) if sides[k][2] != COHESION]
     if len(firm) < len(bounds) and any(missed):
         _yield_cohesion(goal, bounds, firm, sides, discs)
-    point = lexicographic(goal, bounds, discs)
+    point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.
     acting = [k for k, (normal, least) in enumerate(bounds)
@@ -267,7 +267,7 @@ def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]],
     Against an opposite firm bound only a motion across would still bring it a little nearer, and
     that would be as hard as the vehicle can.
     """
-    start = lexicographic(goal, firm, discs)
+    start = nearest_in_order(goal, firm, discs)
     for k, (normal, least) in enumerate(bounds):
         if sides[k][2] == COHESION and product(normal, start) < least:
             room = min((max(product(other, start) - bound, 0.0) / -product(other, normal)

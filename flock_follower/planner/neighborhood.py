@@ -157,10 +157,10 @@ def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> l
                       for name in sorted(missing))]
 
 
-def choose_leader(memory: Memory, neighbors: Neighborhood, me: OwnState,
+def lost_leader(memory: Memory, neighbors: Neighborhood, me: OwnState,
                   params: PlannerParams) -> Neighbor | None:
     """
-    Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
+    Return the last estimate of a lost leader to search for, at most ``resume_timeout`` old.
 
     The search begins if no neighbor is in view: a vehicle that has another one in view stays with
     that. The search ends when a leader is at hand again.

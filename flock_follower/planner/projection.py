@@ -168,12 +168,12 @@ def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tu
     return point, len(sides)
 
 
-def lexicographic(goal: complex, sides: Sequence[Side], discs: Discs) -> complex:
+def nearest_in_order(goal: complex, sides: Sequence[Side], discs: Discs) -> complex:
     """
-    Return the point of the discs nearest to ``goal`` that meets the bounds, the first first.
+    Return the point of the discs nearest to ``goal`` within the bounds, in order of priority.
 
-    A bound for which those before it leave no room is met as nearly as they allow, so that no
-    bound relaxes one before it. A bound whose normal is zero bounds nothing.
+    If the bounds before one leave no room for it, it is met as nearly as they allow: no bound
+    relaxes one before it. A bound whose normal is zero is ignored.
     """
     sides = [(normal, min(max(least, -_HUGE), _HUGE)) for normal, least in sides if normal]
     point, k = optimum(goal, False, sides, discs)

@@ -66,9 +66,9 @@ APPROACH_SPEED_MAX = 0.4
 VELOCITY_TIME = 0.6
 #: Of the observer of the disturbance, 1/s.
 BANDWIDTH = 0.8
-#: Largest disturbance that is offset, m/s^2: without odometry the tilt of PX4 was wrong by 1 m/s^2
-#: for 10 s.
-OFFSET_MAX = 0.8
+#: Largest disturbance that is compensated, m/s^2: without odometry the tilt of PX4 was wrong by
+#: 1 m/s^2 for 10 s.
+MAX_COMPENSATED_DISTURBANCE = 0.8
 #: m beyond the band: an error of the tilt is then larger than the acceleration that may offset it,
 #: the follower runs away, and commands nothing more.
 RUNAWAY = 1.0
@@ -77,7 +77,11 @@ CLOSING = 2.0
 
 
 class Disturbance(NamedTuple):
-    """Relative acceleration that is not commanded: by an error of the tilt, or the leader's."""
+    """
+    Relative acceleration that was not commanded.
+
+    It comes from a tilt error or from the leader's acceleration.
+    """
 
     velocity: Array | None = None
     """Relative velocity, estimated (3,), m/s."""
@@ -97,7 +101,7 @@ class Disturbance(NamedTuple):
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
         return Disturbance(
             self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
-            response, limit_norm(estimate, OFFSET_MAX))
+            response, limit_norm(estimate, MAX_COMPENSATED_DISTURBANCE))
 
 
 def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,

@@ -45,7 +45,7 @@ from flock_follower.planner.memory import by_name, Loss, Memory, update_motions
 from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import (
     build_neighborhood,
-    choose_leader,
+    lost_leader,
     Neighborhood,
     NOBODY,
 )
@@ -100,7 +100,7 @@ class Scene(NamedTuple):
     neighbors: Neighborhood
     """The neighbors at hand in TRACK, else none."""
     leader: Neighbor | None
-    """The leader to look for while others are followed."""
+    """Last estimate of a lost leader to search for while others are followed."""
     missed: Neighbor | None
     """The lost neighbor: ``leader``, or the newest one of those lost if none is followed."""
     predictions: Mapping[str, Prediction]
@@ -114,7 +114,7 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
     if state is State.TRACK:
         here = [propagate(n, me.stamp) for n in memory.neighbors.values()]
         neighbors = build_neighborhood(memory, me, here, params, elapsed)
-        leader = choose_leader(memory, neighbors, me, params)
+        leader = lost_leader(memory, neighbors, me, params)
     flock = _flock(memory, me.stamp, state, leader, params)
     missed = leader
     if leader is None and neighbors.faced is None:

@@ -134,7 +134,7 @@ def vertical(view: View, bearing: float) -> tuple[float, float]:
 IMAGES = 3
 #: Distance of the predicted marker to the image's edge, m: two markers of 0.2 m.
 OCCLUSION_MARGIN = 0.4
-_SAME = 1e-6  # s: stamps that differ by less are of one image
+_STAMP_TOLERANCE = 1e-6  # s: stamps that differ by less are of one image
 
 
 class Occlusion(NamedTuple):
@@ -159,13 +159,14 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     """
     if n is None or n.received or not view:
         return None if n is None else before
-    missed = sum(stamp > n.stamp + _SAME for stamp in frames)
+    missed = sum(stamp > n.stamp + _STAMP_TOLERANCE for stamp in frames)
     if before is None:
         offset = propagate(n, me.stamp).position - me.position
         lost = missed >= IMAGES and visible(view, offset, me.yaw, forward, OCCLUSION_MARGIN)
         return Occlusion(n.stamp) if lost else None
     if missed >= IMAGES:
         return Occlusion(n.stamp)
-    found = min(before.found, n.stamp) if n.stamp > before.lost + _SAME else math.inf
-    shown = sum(found - _SAME <= stamp <= n.stamp + _SAME for stamp in frames)
+    found = min(before.found, n.stamp) if n.stamp > before.lost + _STAMP_TOLERANCE else math.inf
+    shown = sum(found - _STAMP_TOLERANCE <= stamp <= n.stamp + _STAMP_TOLERANCE
+                for stamp in frames)
     return None if shown >= IMAGES else before._replace(found=found)

@@ -36,9 +36,9 @@ from flock_follower.planner import relative
 from flock_follower.planner.guard import (
     climb_range,
     constrain,
+    fallback_retreat_velocity,
     overflight,
     retreat,
-    retreat_velocity,
 )
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.limits import SEPARATION
@@ -107,7 +107,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     return memory, Decision(
         state, reason, command.acceleration, yaw,
         turn_rate(last_yaw, yaw, me, params, elapsed), command.separation_axis,
-        retreat_velocity(memory, scene, params), stamp,
+        fallback_retreat_velocity(memory, scene, params), stamp,
         command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
 
@@ -142,7 +142,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
 
 def _judge_occlusion(memory: Memory, now: float, frames: Sequence[float],
                      view: View) -> Occlusion | None:
-    """Return whether the faced neighbor is occluded."""
+    """Return the occlusion of the faced neighbor, or None."""
     if memory.own is None or memory.followed is None:
         return None
     me = propagate(memory.own, now)

@@ -30,7 +30,7 @@ from flock_follower.view.scene import ARROW, BOX, COLORS, ELLIPSOID, LINE, Shape
 
 WIDTH = 640  # px: a wider image is reduced, for the link and the processor
 QUALITY = 70  # of the JPEG: 640x480 px take about 40 kB
-FONT = 0.6  # scale of OpenCV's font: letters 13 px high
+FONT_SCALE = 0.6  # scale of OpenCV's font: letters 13 px high
 FARTHEST_PIXEL = 16384.0  # px: a line with a point farther outside is not drawn
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 _SIGNS: Final = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5)
@@ -111,12 +111,12 @@ def _text(canvas: Canvas, at: Array, text: str, color: Any) -> None:
     if not (np.abs(at) < FARTHEST_PIXEL).all():
         return
     plain = text.encode('ascii', 'replace').decode()
-    (width, height), _ = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, FONT, 1)
+    (width, height), _ = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, 1)
     rows, columns = canvas.shape[:2]
     if not (0.0 <= at[0] < columns and -2.0 * rows < at[1] < rows):
         return
     x = int(min(max(at[0] - 0.5 * width, 2), max(columns - width - 2, 2)))
     y = int(min(max(at[1], height + 4), rows - 4))
     for paint, thickness in ((0, 0, 0), 3), (color, 1):
-        cv2.putText(canvas, plain, (x, y), cv2.FONT_HERSHEY_SIMPLEX, FONT, paint, thickness,
+        cv2.putText(canvas, plain, (x, y), cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, paint, thickness,
                     cv2.LINE_AA)

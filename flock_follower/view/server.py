@@ -200,7 +200,11 @@ class PageServer:
         return f'flock_follower_{self.port}'  # browsers do not tell ports apart
 
     def _read_token(self, request: web.Request) -> str:
-        """Return the token that a request offers; a cookie of an earlier start is none."""
+        """
+        Return the token from the query or from the cookie, else ''.
+
+        A cookie from an earlier run of the server is ignored.
+        """
         given = request.query.get('token', '')
         cookie = request.cookies.get(self._cookie, '')
         return given or (cookie if self.access.matches(cookie) else '')

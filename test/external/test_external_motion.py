@@ -84,7 +84,7 @@ def test_both_truths_are_enu_from_where_the_vehicle_was_first_heard_of(kind):
     assert (x, w) == (pytest.approx(math.sin(0.1)), pytest.approx(math.cos(0.1)))
 
 
-def test_a_place_told_in_steps_of_a_centimetre_moves_evenly_and_does_not_drift():
+def test_a_place_told_in_steps_of_a_centimeter_moves_evenly_and_does_not_drift():
     motion, steps = ExternalMotion(), []
     for k in range(400):
         motion.take(truth('HIL_STATE_QUATERNION', (0.006 * k, 0, 0), (0.3, 0, 0)), 20 * MS * k)

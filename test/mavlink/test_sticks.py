@@ -21,7 +21,7 @@ import pytest
 
 from flock_follower.gate.permission import Phase
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.sticks import Sticks, StickWatch, take_over_slowly
+from flock_follower.mavlink.sticks import needs_stick_handover, Sticks, StickWatch
 from flock_follower.mavlink.telemetry import Telemetry
 
 RATE = 10.0  # Hz
@@ -197,7 +197,7 @@ def test_it_acts_where_slow_sticks_do_not_take_over(autopilot, reported, known, 
         parameters.take_version(version(*reported))
     if known:
         parameters.values['MAN_OVERRIDE_SPD'] = 3.0
-    assert take_over_slowly(telemetry.dialect, parameters) is watched
+    assert needs_stick_handover(telemetry.dialect, parameters) is watched
 
 
 def sticks_in_flight(minor, accepts):

@@ -94,7 +94,7 @@ def box(vehicle: Vehicle, tmp_path: Path) -> Iterator[Driven]:
 
 
 def numbers(path: Path) -> list[int]:
-    """Return the numbers of the odometry messages in a recording; none if it cannot be read."""
+    """Return the numbers of the odometry messages in a recording; empty if it cannot be read."""
     try:
         with open_bag(path) as bag:
             return [round(deserialize(m.data, m.msgtype).pose.pose.position.x)

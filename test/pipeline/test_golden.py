@@ -56,7 +56,7 @@ def test_nothing_that_is_published_moves_by_more_than_1e_4(result: list[Row]) ->
     assert moved < 1e-4, where
 
 
-def test_positions_agree_within_a_millimetre_with_any_opencv(result: list[Row]) -> None:
+def test_positions_agree_within_a_millimeter_with_any_opencv(result: list[Row]) -> None:
     golden, rows = ([row for row in rows if row[0] == '/neighbors']
                     for rows in (golden_result.read(), result))
     moved, where = worst(rows, golden, slice(0, 3))

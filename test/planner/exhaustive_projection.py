@@ -78,7 +78,7 @@ def farthest(direction: complex, sides: Sequence[Side], discs: Discs) -> complex
                key=lambda point: product(direction, point), default=None)
 
 
-def lexicographic(wanted: complex, sides: Sequence[Side], discs: Discs) -> complex:
+def nearest_in_order(wanted: complex, sides: Sequence[Side], discs: Discs) -> complex:
     """Return the point of the discs nearest to ``wanted`` that meets the first bounds first."""
     met, best = list[Side](), None
     for normal, least in sides:

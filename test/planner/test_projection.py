@@ -23,7 +23,7 @@ import exhaustive_projection as reference
 import numpy as np
 import pytest
 
-from flock_follower.planner.projection import Discs, lexicographic, optimum, product, Side
+from flock_follower.planner.projection import Discs, nearest_in_order, optimum, product, Side
 
 CASES = 120  # of each kind of bounds
 DISCS = ('any', 'any', 'guard', 'tangent outside', 'tangent inside', 'same', 'point')
@@ -82,8 +82,8 @@ def test_the_first_bounds_first_is_what_trying_all_candidates_finds(kind: str) -
         rng = np.random.default_rng([2, KINDS.index(kind), case])
         discs = two_discs(rng, DISCS[rng.integers(len(DISCS))])
         sides, wanted = bounds(rng, discs, kind, 7), 3.0 * normal(rng)
-        point = lexicographic(wanted, sides, discs)
-        assert point == pytest.approx(reference.lexicographic(wanted, sides, discs), abs=1e-6)
+        point = nearest_in_order(wanted, sides, discs)
+        assert point == pytest.approx(reference.nearest_in_order(wanted, sides, discs), abs=1e-6)
         assert reference.holds(point, [], discs), case
 
 
@@ -116,7 +116,7 @@ def test_bounds_that_exclude_one_another_by_rounding_only_are_all_met() -> None:
         together = int(rng.integers(1, len(normals) + 1))
         excess[together:together + 1] = 1.0
         sides = [(n, product(n, place) + float(more)) for n, more in zip(normals, excess)]
-        point = lexicographic(3.0 * normal(rng), sides, discs)
+        point = nearest_in_order(3.0 * normal(rng), sides, discs)
         assert min(product(n, point) - least for n, least in sides[:together]) > -1e-4, case
 
 
@@ -127,5 +127,5 @@ def test_bounds_that_exclude_one_another_by_rounding_only_are_all_met() -> None:
 @pytest.mark.filterwarnings('error')
 def test_bounds_without_a_direction_or_without_an_end(sides: list[Side],
                                                       expected: complex) -> None:
-    point = lexicographic(0.3 + 0j, sides, Discs(0j, 2.0, 1 + 0j, 4.0))
+    point = nearest_in_order(0.3 + 0j, sides, Discs(0j, 2.0, 1 + 0j, 4.0))
     assert point == pytest.approx(expected, abs=1e-6)

@@ -34,7 +34,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 
-from flock_follower.fast_dds import open_shared_memory, undelivered
+from flock_follower.fast_dds import opened_segment_names, undelivered
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -124,7 +124,7 @@ class Input:
                 return f'QoS mismatch with {publisher.node_name}: {why}'
         if self._sporadic:
             return ''
-        fault = undelivered(open_shared_memory(), os.getuid())
+        fault = undelivered(opened_segment_names(), os.getuid())
         return f'{len(publishers)} publisher(s), ' + (fault or 'none sending')
 
 

@@ -58,7 +58,7 @@ class NodeClock(Protocol):
 
 
 class StaticChild:
-    """The frames of ``/tf_static``; none if tf2_msgs is not installed, as in the PyPI runtime."""
+    """The frames of ``/tf_static``; empty without tf2_msgs, as in the PyPI runtime."""
 
     def __init__(self, node: Node) -> None:
         self.frames = StaticFrames()
