@@ -70,7 +70,7 @@ class Judgment(NamedTuple):
     why: str
 
     def __str__(self) -> str:
-        """Return it as one line."""
+        """Return the judgment as one line."""
         must = 'must' if self.dangerous else 'should'
         return f'{self.parameter} = {self.value:g}: {must} be {self.valid}: {self.why}'
 
@@ -91,7 +91,7 @@ def find_unsafe_settings(values: Mapping[str, Any], camera: Camera = UNKNOWN) ->
 
 def refuse(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> None:
     """
-    Refuse a set of parameters that endangers.
+    Refuse a set of parameters that is dangerous.
 
     :raises ValueError: naming the parameter, its value and the nearest value that flies.
     """

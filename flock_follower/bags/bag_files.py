@@ -47,7 +47,7 @@ class BagFiles(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """Return the command that saves what is whole."""
+        """Return the command that recovers the undamaged messages."""
         if self.compressed:
             return "decompress it by 'ros2 bag convert', with the plugin that compressed it"
         file = self.paths[0] if len(self.paths) == 1 else 'FILE'

@@ -70,7 +70,7 @@ HOW: Final = 'stand the leader on the ground, and move the camera 1 m towards it
 
 class Ratio(NamedTuple):
     """
-    The changes of the distance seen, in those of the true one, and the deviation of this ratio.
+    Ratio of the changes of the seen distance to those of the true one, and its deviation.
 
     ``moved``: RMS way of the camera, m; ``left``: RMS of the changes that remain, m.
     """

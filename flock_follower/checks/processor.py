@@ -61,7 +61,7 @@ class Load(NamedTuple):
 
     @property
     def busy(self) -> bool:
-        """Return whether times measured meanwhile say nothing about these processes."""
+        """Return whether the load makes the times measured meanwhile useless."""
         return self.share > BUSY_SHARE
 
     def __str__(self) -> str:
@@ -100,7 +100,7 @@ def stopped(process: int, proc: Path = PROC) -> bool:
 
 def longest_wait(before: Mapping[Path, tuple[int, int]],
                  after: Mapping[Path, tuple[int, int]]) -> float:
-    """Return the time, s, for which that thread waited that waited longest between readings."""
+    """Return the longest time, s, that a thread waited between two readings."""
     return 1e-9 * max((counted[1] - before.get(path, (0, 0))[1]
                        for path, counted in after.items()), default=0)
 
@@ -155,7 +155,7 @@ class LoadMeter:
         self._windows: list[tuple[float, Load]] = []
 
     def sample(self, now: float) -> None:
-        """Read the counters at a time, s; more often than every LOAD_PERIOD is in vain."""
+        """Read the counters at a time, s; a call within LOAD_PERIOD of the last one is ignored."""
         if self._recent and now - self._recent[-1].time < LOAD_PERIOD:
             return
         counters = read_counters(self._processes(), now, self._proc, self._usable)

@@ -91,17 +91,17 @@ class Frame:
         return math.sqrt(max(variances[1:].sum(), 0.0)), math.sqrt(max(variances[0], 0.0))
 
     def lever(self, position: Array) -> Array:
-        """Return the vector (3,), m, in the own frame from the anchor to a position in it."""
+        """Return the vector (3,), m, from the anchor to a position, turned to the own frame."""
         return yaw_rotation(self.yaw).dot(position - self.anchor)
 
     def locate(self, position: Array) -> tuple[Array, Array]:
-        """Return a position in it in the own frame (3,), and the frame's share (3, 3) in it."""
+        """Return a position in the own frame (3,), and the covariance (3, 3) by this frame."""
         lever = self.lever(position)
         H = _jacobian(lever)[:3]
         return self.place + lever, H.dot(self.covariance).dot(H.T)
 
     def point(self, point: TrackPoint) -> TrackPoint:
-        """Return a track point of it in the own frame."""
+        """Return a track point of this frame in the own frame."""
         rotation, (position, share) = yaw_rotation(self.yaw), self.locate(point.position)
         return point._replace(
             position=position, velocity=rotation.dot(point.velocity),

@@ -43,7 +43,7 @@ _SINE = (3.141592653589635, -5.167712779988027, 2.5501640359098254, -0.599264433
 def edges(position: Array, positions: Array, radii: Array, own_radius: float,
           held: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
-    Return (m,) which of at least two neighbors share an edge with this vehicle.
+    Return which of m >= 2 neighbors share an edge with this vehicle, (m,).
 
     All distances are between hulls.
 

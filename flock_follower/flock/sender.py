@@ -65,7 +65,7 @@ class Sender:
     """Until when, ns, and why it is ignored."""
 
     def sent_at(self, stamp: int, received: int) -> None:
-        """Note the stamp of a state of itself; a sender that sends too often is ignored."""
+        """Note the stamp of the sender's own state; a sender that sends too often is ignored."""
         self.sent.append(stamp)
         if len(self.sent) == BURST_COUNT and stamp - self.sent[0] < BURST_TIME:
             self.ban = received + BAN_TIME, f'sends {BURST_COUNT} times in {BURST_TIME / 1e9:g} s'
@@ -73,14 +73,14 @@ class Sender:
 
     @property
     def vague(self) -> bool:
-        """Return whether its frame is unknown or too uncertain."""
+        """Return whether the sender's frame is unknown or too uncertain."""
         if self.frame is None:
             return True
         place, yaw = self.frame.stds
         return not (place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX)  # NaN is vague
 
     def unusable(self, now: int) -> str:
-        """Return why its messages are not used at a time, ns, or ''."""
+        """Return why the sender's messages are not used at a time, ns, or ''."""
         if now < self.ban[0]:
             return self.ban[1]
         if self.frame is None:
@@ -93,7 +93,7 @@ class Sender:
 
     @property
     def slow(self) -> str:
-        """Return a warning if all of its last messages were old on reception, or ''."""
+        """Return a warning if all last messages of the sender were old on reception, or ''."""
         least = min(self.ages, default=0.0)
         return '' if least < SLOW_LINK else (
             f'messages are {least:.2f} s old or more: a slow way, or its clock is behind')

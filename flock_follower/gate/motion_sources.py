@@ -124,7 +124,7 @@ class MotionSources:
         return next((yaw for yaw, time in yaws if now - time <= max_age), None)
 
     def best_velocity(self, limits: GateLimits, now: float) -> Velocity | None:
-        """Return the velocity by the source; if there is none, that to brake with; or None."""
+        """Return the velocity by the source, else the velocity to brake with, else None."""
         by_source = self._sources[self.source].motion(now).fresh_velocity(limits)
         return by_source or self.known_motion(limits, now).braking
 

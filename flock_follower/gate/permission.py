@@ -52,7 +52,7 @@ LONGEST_SILENCE: Final[float] = 5.0
 
 
 class Cause(enum.Enum):
-    """Why it is not ACTIVE."""
+    """Why the permission is not ACTIVE."""
 
     NOT_REQUESTED = enum.auto()
     WAITING = enum.auto()
@@ -90,7 +90,7 @@ STICK: Final[Taker] = Taker('the pilot moved a stick', True)
 
 
 class Phase(enum.Enum):
-    """A phase; the value is announced."""
+    """A phase of the permission; its value is announced."""
 
     INACTIVE = bridge_state.INACTIVE
     READY = bridge_state.READY

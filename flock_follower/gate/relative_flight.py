@@ -110,7 +110,7 @@ class RelativeFlight:
         self._time = -math.inf
 
     def lasts(self, now: float) -> float:
-        """Return its duration, earlier times included, s; NaN: not permitted."""
+        """Return how long it has lasted, with earlier flights, s; NaN: not permitted."""
         lasted = self._spent + min(now, self._usable_since) - self._begun
         permitted = self.reckoning is not None and 0.0 <= lasted <= self._timeout
         return lasted if permitted else math.nan
@@ -123,7 +123,7 @@ class RelativeFlight:
     def update(self, active: bool, commanded: bool, usable: bool, height: float | None,
                now: float) -> None:
         """
-        Begin or end it.
+        Begin or end the flight without odometry.
 
         :param active: whether the vehicle flies our setpoints by permission.
         :param commanded: whether the last setpoint was a command.

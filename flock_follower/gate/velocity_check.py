@@ -219,7 +219,7 @@ LATCH_TIME: Final[float] = 0.6
 
 
 class VelocityComparison:
-    """Averages the difference of two velocities, and stores since when it is too large."""
+    """Averages the difference of two velocities; stores the time since which it is too large."""
 
     def __init__(self) -> None:
         self._average: Array = np.zeros(3)

@@ -205,7 +205,7 @@ class Identity:
                 self._places.take(place, now)
 
     def conflict(self, now: float) -> str:
-        """Return that two vehicles send, and by which evidence, or two bridges, or ''."""
+        """Return the evidence that two vehicles, or two bridges, send, or ''."""
         if len(self._rivals) == _RIVAL_BEATS and now - self._rivals[0] <= FINDING:
             return (f'{SECOND_BRIDGE}: end one, a second mavlink_bridge or MAVROS; or set '
                     'source_system')

@@ -67,7 +67,7 @@ class Question:
         self.tries, self.since, self.answered = 0, math.inf, now
 
     def is_ignored(self, now: float) -> bool:
-        """Return whether it was asked often enough, and for long enough, without an answer."""
+        """Return whether the question was asked often and long enough without an answer."""
         return self.tries >= TRIES and now - self.since >= PATIENCE
 
 
@@ -125,7 +125,7 @@ class LinkQuestions:
         return -math.inf if question is None else question.answered
 
     def unknown(self, now: float) -> list[str]:
-        """Return the questions that have no answer, or none any more."""
+        """Return the questions without a valid answer."""
         # A copy: diagnostics read them from another thread.
         return [name for name, question in self._questions.copy().items()
                 if question.tries and (math.isinf(question.answered) or question.is_ignored(now))]

@@ -133,7 +133,7 @@ class OdometryForwarder:
 
 def has_jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
     """
-    Return whether a pose differs from the one predicted from time ``then``, s, or time fell.
+    Return whether a pose is not the one predicted from time ``then``, s, or time decreased.
 
     A rule of its own: each jump that is counted resets the autopilot's estimate, so the small
     steps by which ``derivation`` restarts its filter must not count.

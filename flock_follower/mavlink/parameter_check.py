@@ -80,7 +80,7 @@ class Recommendation(NamedTuple):
                     or math.isclose(value, self.value, rel_tol=1e-5, abs_tol=1e-9))
 
     def applies(self, version: Version | None) -> bool:
-        """Return whether a firmware has it; one of unknown version (None) might not."""
+        """Return whether a firmware has the parameter; None: whether all known versions do."""
         if version is None:
             return (self.since, self.until) == (_FIRST_VERSION, _LAST_VERSION)
         return self.since <= version[:2] <= self.until

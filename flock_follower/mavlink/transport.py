@@ -194,7 +194,7 @@ class SerialTransport(_Line):
         return fd
 
     def close(self) -> None:
-        """Release the port, for others, too."""
+        """Release the port, and the lock that keeps other processes out."""
         if self._fd >= 0:
             # Otherwise it stays exclusive while another process has it open.
             with contextlib.suppress(OSError):  # unplugged

@@ -66,7 +66,7 @@ def patience(service: str) -> float:
 
 
 def proposal(service: str, there: Iterable[str]) -> str:
-    """Return which service is meant, as a question; ``there`` are full names. '' if none is."""
+    """Return a question for the service that is meant, or ''; ``there`` are full names."""
     last = service.rpartition('/')[2]
     known = {*there, *OUR_SERVICES}
     meant = sorted(name for name in known if name.rpartition('/')[2] == last and name != service)

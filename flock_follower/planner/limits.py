@@ -262,7 +262,7 @@ def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]],
                     firm: Sequence[tuple[complex, float]],
                     sides: Sequence[tuple[complex, float, str]], discs: Discs) -> None:
     """
-    Reduce the bounds of cohesion to what is left towards the neighbor beside the firm bounds.
+    Reduce the cohesion bounds to the motion towards the neighbor that firm bounds leave.
 
     Against an opposite firm bound only a motion across would still bring it a little nearer, and
     that would be as hard as the vehicle can.

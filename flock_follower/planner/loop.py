@@ -118,7 +118,7 @@ class PlannerLoop:
 
     def waiting_reason(self, bridge_age: float = math.inf) -> str:
         """
-        Return the reason why it is not active although engaged, or ''.
+        Return why the planner is not active although it is engaged, or ''.
 
         :param bridge_age: time since the last message of the bridge, s, by a steady clock.
         """

@@ -138,7 +138,7 @@ KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
 
 
 def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> list[str]:
-    """Return warnings of neighbors that it cannot follow, and of those whose place is unknown."""
+    """Return warnings of neighbors that cannot be followed, or whose place is unknown."""
     v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
     for n in neighbors.flock:

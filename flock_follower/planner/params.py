@@ -258,7 +258,7 @@ class PlannerParams(Checked):
 
     @property
     def fastest(self) -> float:
-        """Return the largest speed at which it keeps clear of others, m/s."""
+        """Return the largest speed of keeping clear of others, m/s."""
         return max(self.v_max, self.v_max_start)
 
     @cached_property
@@ -268,7 +268,7 @@ class PlannerParams(Checked):
 
     @property
     def climb_rate(self) -> float:
-        """Return how fast it may climb or descend, m/s: v_max leaves room for the rest."""
+        """Return the largest vertical speed, m/s, which leaves a part of v_max to level motion."""
         return min(self.climb_rate_max, CLIMB_SHARE * self.v_max)
 
     def __post_init__(self) -> None:

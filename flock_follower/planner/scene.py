@@ -142,7 +142,7 @@ def _predict(n: Neighbor, memory: Memory, me: OwnState,
 def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
            params: PlannerParams) -> Mapping[str, Neighbor]:
     """
-    Return those at hand, and those lost that may still be near: to keep clear of.
+    Return the neighbors to keep clear of: those at hand, and lost ones that may be near.
 
     :param leader: the leader to look for.
     """
@@ -156,7 +156,7 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
 
 
 def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
-    """Return whether a follower that was received is received no more: it may have failed."""
+    """Return whether a received follower has fallen silent: it may have failed."""
     return (n.received and n.member.role == FOLLOWER
             and now - n.stamp > params.heard_timeout)
 
@@ -171,7 +171,7 @@ def expected_now(n: Neighbor, memory: Memory, now: float, params: PlannerParams)
 
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
           params: PlannerParams) -> Loss | None:
-    """Return the loss of the neighbor that it followed or looks for."""
+    """Return the loss of the neighbor that was followed, or is searched for."""
     me, leader = scene.me, scene.leader
     if (scene.state is State.TRACK and leader is None) or memory.followed is None:
         return None

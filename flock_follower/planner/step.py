@@ -116,7 +116,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
           blinded: str, waiting: str, view: View, frames: Sequence[float]
           ) -> tuple[Memory, State, str, float | None]:
     """
-    Return the memory, the state and the reason for it, and the stamp of the newest estimate, s.
+    Return memory, state, the reason for the state, and the stamp of the newest estimate, s.
 
     That estimate is one to follow: one seen, else one received. The memory has given up if no
     neighbor was followed for too long; it then sends no commands.
@@ -207,7 +207,7 @@ def _yaw(last: float, memory: Memory, scene: Scene, params: PlannerParams,
 
 def _warnings(memory: Memory, scene: Scene, reason: str,
               params: PlannerParams) -> tuple[str, ...]:
-    """Return warnings: neighbors that it cannot follow, and the reaction to lost ones."""
+    """Return warnings: neighbors that cannot be followed, and the reaction to lost ones."""
     me, leader = scene.me, scene.leader
     if scene.state is State.TRACK:
         search = '' if leader is None else (

@@ -141,7 +141,7 @@ class Altitude(NamedTuple):
 
 def _stopped_within(gap: float, gain: float) -> float:
     """
-    Return the speed, m/s, from which it stops within a gap, m; beyond a bound, the return speed.
+    Return the speed, m/s, that can be stopped within a gap, m; negative: the return speed.
 
     :param gain: speed for each meter, 1/s, while the deceleration is at most BRAKING; farther away
         the deceleration is BRAKING.

@@ -36,7 +36,7 @@ TOKEN_BYTES: Final = 16
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host is reached from this machine alone; a name but localhost may not."""
+    """Return whether a host is reached from this machine alone; of names only localhost is."""
     if host == 'localhost':
         return True
     try:

@@ -137,7 +137,7 @@ class ShownFlight:
         self.note('command', now)
 
     def take_state(self, word: str) -> None:
-        """Take the latched state of the planner, which tells nothing of the planner's life."""
+        """Take the latched state of the planner; it does not show that the planner still runs."""
         self._state = word
 
     def take_bridge(self, text: str, now: float) -> None:

@@ -47,7 +47,7 @@ class RemoteParameters:
         self._get = node.create_client(GetParameters, f'{other}/get_parameters')
 
     def ask(self) -> bool:
-        """Ask for all; return False if the node was not found, as one that has just started."""
+        """Request all; return False if the node was not found: it may have just started."""
         if not (self._list.service_is_ready() and self._get.service_is_ready()):
             return False
         self._list.call_async(ListParameters.Request()).add_done_callback(self._take_names)
