@@ -34,7 +34,7 @@ from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
 from flock_desk.closed_loop.metrics import (
     band_exits,
-    joined,
+    concatenate_measures,
     measure,
     Measures,
     of_runs,
@@ -125,7 +125,7 @@ def _campaign(options: argparse.Namespace) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     flown = fly_all(scenarios, options.controllers, options.runs, options.jobs, options.seed,
                     options.scheduler)
-    results = {name: {controller: summary(joined([part.runs for part in parts]))
+    results = {name: {controller: summary(concatenate_measures([part.runs for part in parts]))
                       for controller, parts in of_scenario.items()}
                for name, of_scenario in flown.items()}
     path = options.output / 'flights.json'

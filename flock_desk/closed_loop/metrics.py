@@ -285,7 +285,7 @@ def of_runs(rows: Measures, flights: Flights) -> Measures:
     return runs
 
 
-def joined(parts: Sequence[Measures]) -> Measures:
+def concatenate_measures(parts: Sequence[Measures]) -> Measures:
     """Return the measures of all runs of several parts, in their order."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 

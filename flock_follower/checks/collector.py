@@ -45,7 +45,7 @@ from flock_follower.parameters.sections import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
-from flock_follower.perception.markers import Detections, joined
+from flock_follower.perception.markers import concatenate_detections, Detections
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 from flock_follower.perception.prints import turned_print, with_wide_borders, wrong_border
@@ -190,7 +190,7 @@ class Collector:
             found = everywhere(pixels, config.dictionary)
             for search in (thoroughly, with_wide_borders):  # which take longer
                 if not markers.keys() & set(found.ids.tolist()):
-                    found = joined(found, search(pixels, config.dictionary))
+                    found = concatenate_detections(found, search(pixels, config.dictionary))
             fits = camera is not None and pixels.shape == (camera.height, camera.width)
             up = _upwards(seen, path, picture.stamp) if len(found.ids) else None
             seen.sightings += self._measure(

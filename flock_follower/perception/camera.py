@@ -51,9 +51,9 @@ DISTORTION_MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 #: Focal lengths as a share of the image's longer side, beyond what any lens has (the widest
 #: fisheye 0.2): outside, K is in other units, or noise.
 FOCAL_LENGTH_RANGE = (0.02, 1000.0)
-#: Largest distance of the optical axis from the middle, share of the image: K for images of
-#: twice or half the size is off by 0.5 and 0.25.
-OFF_CENTER = 0.15
+#: Largest distance of the optical axis from the middle, as a share of the image size: K for
+#: images of twice or half the size is off by 0.5 and 0.25.
+MAX_AXIS_OFFSET = 0.15
 _SIZE = Range(1, 65535, 'px', whole=True)
 #: Beyond this radius in normalized coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
@@ -61,7 +61,7 @@ _RADIUS_LIMIT = 10.0
 
 def off_center(shares: Array) -> bool:
     """Return whether the optical axis at shares (2,) of width and height is far off the middle."""
-    return bool(np.abs(shares - 0.5).max() > OFF_CENTER)
+    return bool(np.abs(shares - 0.5).max() > MAX_AXIS_OFFSET)
 
 
 def marked_rectified(topic: str) -> bool:

@@ -110,7 +110,7 @@ class CameraSchedule:
 
     def in_view(self, name: str, model: CameraModel, T_camera_body: Transform) -> bool:
         """Return whether the middle of a marker is in the image, or nearly, and faces it."""
-        to_camera, (left, top, right, bottom) = T_camera_body.rotation.T, _edges(model)
+        to_camera, (left, top, right, bottom) = T_camera_body.rotation.T, _view_limits(model)
         places, normals = self._markers[name]
         # In plain numbers: for every image, and so small.
         for (x, y, z), (u, v, w) in zip((places.dot(to_camera) + T_camera_body.translation)
@@ -146,7 +146,7 @@ class CameraSchedule:
 
 
 @lru_cache(maxsize=16)
-def _edges(camera: CameraModel) -> tuple[float, float, float, float]:
+def _view_limits(camera: CameraModel) -> tuple[float, float, float, float]:
     """Return the least and greatest (X/Z, Y/Z) in an image: left, top, right, bottom."""
     along = np.linspace(0.0, 1.0, 9)
     ends = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])

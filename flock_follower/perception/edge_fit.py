@@ -54,12 +54,14 @@ MAX_SPACING = 1.2
 MAX_SPACING_SHARE = 0.1
 #: Samples on either side of the middle, of the smoothed derivative and of the kernel.
 _HALF_WIDTH = N_DERIVATIVES // 2
-#: The same of a profile.
-_REACH = 2 * _HALF_WIDTH
+#: Samples on either side of the middle of a profile.
+_PROFILE_HALF_LENGTH = 2 * _HALF_WIDTH
 #: Standard deviation of the kernel, samples.
 _KERNEL_SIGMA = 2.0
 #: A point and a step, (1, 2), times this: the places along a profile.
-_STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
+_STEPS = np.stack([
+    np.ones(2 * _PROFILE_HALF_LENGTH + 1),
+    np.arange(-_PROFILE_HALF_LENGTH, _PROFILE_HALF_LENGTH + 1.0)]).astype(np.float32)
 #: Least slope of an edge, gray levels per px.
 _MIN_SLOPE = 1.0
 #: Least slope of an edge, as a share of the median: in a shadow it is 0.2.
@@ -79,7 +81,7 @@ _MIN_CORRECTED = 2.5
 #: Least variance of the blur to divide by, px^2.
 _MIN_BLUR_VARIANCE = 1e-9
 #: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbor.
-_WITHIN = np.array([1, *range(1, 2 * _HALF_WIDTH), 2 * _HALF_WIDTH - 1])
+_INNER_INDEX = np.array([1, *range(1, 2 * _HALF_WIDTH), 2 * _HALF_WIDTH - 1])
 #: Sums both columns of (n, 2).
 _ONES = np.ones(2)
 #: Subtracts the second column of (n, 2) from the first.
@@ -91,7 +93,7 @@ def _correlation() -> Any:
     k = np.arange(-_HALF_WIDTH, _HALF_WIDTH + 1.0)
     kernel = k * np.exp(-0.5 * (k / _KERNEL_SIGMA)**2)
     kernel /= kernel @ k  # one gray level per sample gives 1
-    matrix = np.zeros((2 * _REACH + 1, 2 * _HALF_WIDTH + 1), dtype=np.float32)
+    matrix = np.zeros((2 * _PROFILE_HALF_LENGTH + 1, 2 * _HALF_WIDTH + 1), dtype=np.float32)
     for i in range(2 * _HALF_WIDTH + 1):
         matrix[i:i + 2 * _HALF_WIDTH + 1, i] = kernel
     return matrix
@@ -104,9 +106,9 @@ class Found(NamedTuple):
     """
     Where edges are in the image.
 
-    ``offsets`` (n,), px, along the normals from where the lines are; ``found`` (n,), bool;
-    ``variance`` (n,), px^2, of the peaks' widths, kernel and blur together. ``known``: the
-    indices of those found across either axis.
+    ``offsets`` (n,), px: along the normals, from the predicted lines. ``found`` (n,), bool.
+    ``variance`` (n,), px^2: squared width (sigma^2) of each peak, from the blur and the kernel
+    together. ``known``: the indices of the edges found across either axis.
     """
 
     offsets: Array
@@ -135,7 +137,7 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
     slope = profiles.dot(_CORRELATION)
 
     peak = slope.argmax(axis=1)
-    within = _WITHIN[peak]
+    within = _INNER_INDEX[peak]
     index = model.begins + within
     values = slope.ravel()
     before, top, after = values[index - 1], values[index], values[index + 1]
@@ -203,7 +205,11 @@ def _widen_for_bloom(spacing: tuple[float, float], bloom: Array) -> tuple[float,
 
 
 def _search_spacing(lines: Lines) -> tuple[float, float]:
-    """Return the spacing, px, at which edges half a cell away are still within reach."""
+    """
+    Return the sample spacing of the profiles for both axes, px.
+
+    With it, a profile reaches an edge that is half a cell from its predicted place.
+    """
     first, second = (max(cell / (2 * _HALF_WIDTH), MIN_SPACING) for cell in lines.narrowest)
     return first, second
 

@@ -47,7 +47,7 @@ from flock_follower.perception.neighbor_motion import FilterParams
 #: A measurement nearer than this to a candidate's expected place is of that candidate, m.
 SAME = 0.3
 #: Tolerance of the distance of a restart, m: errors of both places.
-SLACK = 0.3
+RESTART_TOLERANCE = 0.3
 #: A candidate has moved if it covers this distance, m, within WINDOW.
 MOVED = 0.5
 #: Time in which a moving candidate covers MOVED, s.
@@ -214,8 +214,8 @@ class Hypotheses:
     def _reach(self, time: float) -> float:
         """Return how far from its newest place the primary track can be, m."""
         last = self.primary.newest
-        return SLACK if last is None else (
-            SLACK + self.params.leader_speed_max * max(time - last.stamp, 0.0))
+        return RESTART_TOLERANCE if last is None else (
+            RESTART_TOLERANCE + self.params.leader_speed_max * max(time - last.stamp, 0.0))
 
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
         """Return whether a candidate replaces the primary track; see the module."""

@@ -160,9 +160,10 @@ class MeasuredPose(NamedTuple):
 
 def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
     """
-    Return how long after the first row a point (3,) in the optical frame was exposed, s.
+    Return the delay from the exposure of the first row to that of the row that shows the point, s.
 
     :param readout_time: from the first row to the last, s.
+    :param seen: the point (3,), m, in the optical frame.
     """
     row = float(camera.project(seen[None])[0, 1])
     # Written so that NaN is the middle.

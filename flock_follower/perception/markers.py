@@ -52,7 +52,7 @@ class Detections(NamedTuple):
     corners: Array
 
 
-def joined(*found: Detections) -> Detections:
+def concatenate_detections(*found: Detections) -> Detections:
     """Return all the markers of several searches."""
     return Detections(np.concatenate([each.ids for each in found]),
                       np.concatenate([each.corners for each in found]))

@@ -73,14 +73,14 @@ def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
     """Return the likeliest of one or two poses, given their residuals and the prediction."""
     if len(poses) == 1 or angle(poses[0].pose, poses[1].pose) < SAME_ATTITUDE:
         return Choice(min(poses, key=lambda p: p.chi2), 0.0)  # both in one: soon they may part
-    first, second = (p.chi2 + _surprise(p.pose, expected) for p in poses)
+    first, second = (p.chi2 + _attitude_chi2(p.pose, expected) for p in poses)
     chosen, other = poses if first <= second else reversed(poses)
     margin = abs(second - first)
     odds = math.exp(-0.5 * margin)
     return Choice(chosen, margin, other, odds / (1.0 + odds))
 
 
-def _surprise(pose: Transform, expected: PosePrior) -> float:
+def _attitude_chi2(pose: Transform, expected: PosePrior) -> float:
     """Return how improbable an attitude is, as chi^2, from history and uprightness."""
     surprise = 0.0
     if expected.pose is not None:

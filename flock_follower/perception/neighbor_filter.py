@@ -74,8 +74,8 @@ _TURNING = np.r_[ATTITUDE, RATE]
 GATE_CHI2 = 16.27
 #: A measurement is refused if its chi^2 is so many times the gate's: 13 standard deviations.
 WILD_FACTOR = 10.0
-#: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
-MIRRORED = 0.3
+#: An attitude outside the gate that differs by this angle, rad, from the expected one is mirrored.
+MIN_MIRROR_ANGLE = 0.3
 #: An attitude is wrong if this many measurements in a row contradict it, for CONTRADICTED_FOR.
 MIN_CONTRADICTIONS = 3
 #: Time for which measurements contradict a wrong attitude, s: the same at every rate of images.
@@ -298,7 +298,8 @@ class NeighborFilter:
         spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
         doubt = squared_distance(turn, spread) / GATE_CHI2
         # A marker's mirrored pose has its position right and its attitude wrong.
-        plausible = doubt <= 1.0 or (doubt <= WILD_FACTOR and float(turn.dot(turn)) < MIRRORED**2)
+        plausible = doubt <= 1.0 or (
+            doubt <= WILD_FACTOR and float(turn.dot(turn)) < MIN_MIRROR_ANGLE**2)
         if plausible:
             if self._surprises_again('attitude', turn, doubt):
                 prior = widened(prior, _TURNING, doubt)

@@ -67,7 +67,7 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
         for axis, color in zip(np.eye(3), AXIS_COLORS):
             tip = 0.5 * neighbor.markers[0].side_length * axis
             _line(canvas, camera.project(body.apply(np.array([np.zeros(3), tip]))), color)
-        _line(canvas, ellipse(camera, measurement), WHITE)
+        _line(canvas, ellipse_pixels(camera, measurement), WHITE)
         lines.append(f'{neighbor.name}: {stage}, {np.linalg.norm(body.translation):.2f} m')
     lines += [f'{name}: the same marker again' for name in sighting.duplicates]
     lines += [f'other marker: {marker_id}' for marker_id in sighting.other_ids]
@@ -79,7 +79,7 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
     return canvas
 
 
-def ellipse(camera: CameraModel, measurement: Measurement) -> Array:
+def ellipse_pixels(camera: CameraModel, measurement: Measurement) -> Array:
     """Return the pixels (25, 2) of two standard deviations of a place; NaN if out of view."""
     pixels, by_point = camera.linearize(measurement.T_camera_body.apply(measurement.reference))
     spread = by_point[0] @ measurement.covariance[:3, :3] @ by_point[0].T

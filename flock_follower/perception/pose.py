@@ -84,9 +84,9 @@ PLAIN_INLIERS = 0.9
 RUN_TOGETHER = 0.25
 #: If a print that is followed smeared is blurred by more than this, cells, it has no edges to fit.
 EDGELESS = 0.3
-#: So many samples of a smeared print count to decide between two attitudes. Most of what is left
-#: are errors of the model, which are alike for neighboring samples.
-SMEAR_DEGREES = 40.0
+#: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
+#: residuals are errors of the model, which are alike for neighboring samples.
+EFFECTIVE_SMEAR_SAMPLES = 40.0
 
 
 class Target(NamedTuple):
@@ -308,7 +308,7 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
     The image decides so little that the expected attitude would confirm itself: it has no vote.
     """
     least = min(each.rms for each in fits)
-    best = choose([Hypothesis(each.pose, SMEAR_DEGREES * (each.rms / least)**2, each)
+    best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
                    for each in fits], PosePrior(None, expected.up))
     return widened(_smear_measurement(sought, index, best.chosen.fit), best)
 

@@ -216,7 +216,11 @@ def _wrong(agreeing: Array) -> float:
 
 
 def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> bool:
-    """Return whether cells of brightness (n, c), n places in each, are those of a marker."""
+    """
+    Return whether the image shows the marker's code in uneven light.
+
+    ``brightness`` (n, c): gray levels at n sample points in each of c cells.
+    """
     colors = read(brightness, code.windows).mean(axis=0)
     saturated: Any = (brightness >= _SATURATED_LEVEL).any(axis=0)
     end = code.bits.size + code.border
@@ -356,7 +360,7 @@ def _edges(code: Any) -> list[_Edge]:
                 if not light:
                     continue
                 for along in _points_along(first - 1.0, last - 1.0, column in (0, cells)):
-                    room = _room(grid[int(along) + 1], column, light > 0.0)
+                    room = _run_lengths(grid[int(along) + 1], column, light > 0.0)
                     x, y = column - cells / 2.0, along - cells / 2.0
                     # Rows run down, the marker's y axis up: white to the right is the normal +x,
                     # white below is the normal -y. The tangent is the normal turned left.
@@ -372,8 +376,8 @@ def _points_along(start: float, end: float, border: bool) -> Array:
     return np.linspace(start + _END, end - _END, count)
 
 
-def _room(line: Any, column: int, rising: bool) -> tuple[float, float]:
-    """Return how many cells are of one color on the black side of an edge, and on the white."""
+def _run_lengths(line: Any, column: int, rising: bool) -> tuple[float, float]:
+    """Return the lengths, cells, of the black and of the white run of cells at an edge."""
     edges = [-1, *np.flatnonzero(np.diff(line)).tolist(), len(line) - 1]
     k = edges.index(column)
     left, right = float(column - edges[k - 1]), float(edges[k + 1] - column)

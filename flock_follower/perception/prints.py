@@ -33,7 +33,7 @@ import numpy as np
 from flock_follower.geometry import Array, rotation_vector_to_matrix, rpy_from_matrix, Transform
 from flock_follower.neighbors_file import Marker
 from flock_follower.perception.images import gray_levels, GrayImage
-from flock_follower.perception.markers import Detections, joined, marker_code
+from flock_follower.perception.markers import concatenate_detections, Detections, marker_code
 from flock_follower.perception.search import everywhere
 
 #: Cells of the black border that are told apart; the first is that of our prints.
@@ -119,7 +119,8 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
 
 def with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
     """Return the markers with a border of two or three cells, and some with one."""
-    return joined(*(everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
+    return concatenate_detections(*(
+        everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
 
 
 def border_sought(rounds: int) -> int:

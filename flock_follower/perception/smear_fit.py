@@ -76,10 +76,10 @@ _DAMPED_PASSES = 2
 _LAST_TURN = 0.02
 #: A step of pose and smear that is shorter, cells, may be the last.
 _LAST_SHIFT = 0.2
-#: A step that turns by more, rad, or smears by more, cells, leads nowhere.
+#: A step that turns by more, rad, or smears by more, cells, is refused.
 _MAX_TURN = 1.0
-#: A step that is longer than this share of the distance leads nowhere.
-_MAX_OFFSET = 0.5
+#: A step that is longer than this share of the distance is refused.
+_MAX_STEP_SHARE = 0.5
 #: Least depth of a sample, m.
 _MIN_DEPTH = 0.05
 #: Least share of the samples that are in the image.
@@ -291,7 +291,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
         turn, offset = max(map(abs, step[3:6].tolist())), max(map(abs, step[:3].tolist()))
         smear, smeared = smear + step[-2:], max(map(abs, step[-2:].tolist()))
         if (not max(turn, smeared) < _MAX_TURN or response[0] <= 0.0
-                or offset > _MAX_OFFSET * at.center[2]
+                or offset > _MAX_STEP_SHARE * at.center[2]
                 or math.hypot(*smear.tolist()) > _MAX_SMEAR):
             return None
         pose = moved(pose, at.center, step)

@@ -59,10 +59,10 @@ BATCH: Final[float] = 0.6
 MIN_POINTS = 8
 #: Most points in the length of a batch.
 MAX_POINTS = 40
-#: Noise of a point, m: only its ratio to JERK counts.
-NOISE = 0.0015
+#: Standard deviation of a point, m: only its ratio to JERK_DENSITY counts.
+POINT_STD = 0.0015
 #: Spectral density of the jerk, (m/s^3)^2/Hz.
-JERK = 0.5
+JERK_DENSITY = 0.5
 #: Deviations are widened: errors of successive images are alike.
 WIDENING: Final[float] = 2.0
 #: An estimate is applied once it differs from the applied offset by this many deviations, at first
@@ -172,7 +172,7 @@ class TimeOffset:
 def _precision(times: Array) -> Array:
     """Return the inverse covariance (n, n), 1/m^2, of a path with an unknown start, at times."""
     first, apart = np.minimum(times[:, None], times), np.abs(times[:, None] - times)
-    covariance = NOISE**2 * np.eye(len(times)) + JERK * first**3 * (
+    covariance = POINT_STD**2 * np.eye(len(times)) + JERK_DENSITY * first**3 * (
         first**2 / 20.0 + first * apart / 8.0 + apart**2 / 12.0)
     inverse = np.linalg.inv(covariance)
     start = np.vander(times, 3)

@@ -33,7 +33,14 @@ import pytest
 from flock_desk.closed_loop import campaign
 from flock_desk.closed_loop.camera_views import CameraViews
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.metrics import band_exits, Flights, joined, measure, STATES, summary
+from flock_desk.closed_loop.metrics import (
+    band_exits,
+    concatenate_measures,
+    Flights,
+    measure,
+    STATES,
+    summary,
+)
 from flock_desk.closed_loop.world import World
 from flock_desk.flights import main
 from flock_desk.runs.processes import wait_until
@@ -275,7 +282,7 @@ def test_metrics_have_the_documented_meaning() -> None:
             'detection_gap': [0.3, 0.2], 'jerk': [np.sqrt(2 * 5.0 ** 2 / 10), 0.0],
             'tracking_error': [np.sqrt(4.5) - 2.0, m['tracking_error'][1]]}.items():
         assert m[name].tolist() == pytest.approx(values), name
-    whole = summary(joined([m, m]))
+    whole = summary(concatenate_measures([m, m]))
     assert (whole['runs'], whole['in_band'], whole['min_separation_m']) == (
         4, 0.5, pytest.approx(0.8))
 

@@ -25,7 +25,7 @@ from flock_follower.perception.hypotheses import (
     Candidate,
     Hypotheses,
     PATIENCE,
-    SLACK,
+    RESTART_TOLERANCE,
     Taken,
 )
 from flock_follower.perception.neighbor_filter import Estimate, NeighborFilter, UpdateOutcome
@@ -149,7 +149,7 @@ def test_a_restart_that_needs_more_than_its_speed_is_refused(speed: float) -> No
     course.watch(2.0)
     gone = course.time
     course.time += PARAMS.max_gap + 0.5
-    reach = speed * (course.time + DT - gone) + SLACK
+    reach = speed * (course.time + DT - gone) + RESTART_TOLERANCE
     far = course.estimate.position + np.array([0.0, 1.05 * reach, 0.0])
     assert outcomes(course.only(2.0, far)) == {UpdateOutcome.OUTLIER}
 
