@@ -22,6 +22,7 @@ The rules, each with the breach that it lists:
 - ``comment``: the comment of a number goes on from the one above, or ends within a sentence; or
   one number has a comment and the next one has none.
 - ``function``: the name of a function is an adverb, a preposition, an adjective or a participle.
+- ``length``: the name of a test has more than 60 characters.
 - ``spelling``: a word has a British spelling; ``--mend PATH ...`` replaces it.
 
 ``names_accepted.yaml`` lists the accepted breaches of each file. A breach that is not listed, and
@@ -48,7 +49,8 @@ ACCEPTED = Path(__file__).with_name('names_accepted.yaml')
 PACKAGES = ('flock_follower', 'flock_desk')
 #: What the rule of spelling holds for.
 FOLDERS = (*PACKAGES, 'launch', 'examples', 'benchmarks', 'test')
-RULES = ('word', 'line', 'comment', 'function', 'spelling')
+RULES = ('word', 'line', 'comment', 'function', 'length', 'spelling')
+MAX_TEST_NAME = 60  # characters
 Breaches = dict[str, set[tuple[str, str]]]
 
 #: One-word names that say nothing where they are called: no verb, and no noun of a value.
@@ -159,6 +161,8 @@ def find_breaches(root: Path) -> Breaches:
         breaches = {('spelling', word) for word in british_words(text)}
         if file.startswith(PACKAGES):
             breaches |= breaches_of_module(trees[file], text, imported[module_name(file)])
+        breaches |= {('length', name) for name in function_names(trees[file])
+                     if name.startswith('test_') and len(name) > MAX_TEST_NAME}
         if breaches:
             found[file] = breaches
     return found

@@ -87,7 +87,7 @@ def test_predecessors_leave_the_band_as_in_the_reference(
     assert extreme(getattr(run.metrics, figure)) == pytest.approx(reference, abs=digits)
 
 
-def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
+def test_follower_of_papers_leader_stays_in_reference_band() -> None:
     run = simulate(*LEADER_FOLLOWER_START, PAPER_PARAMS, duration=10.0, led=True,
                    sample_period=0.01)
     assert run.metrics.min_r2.min() == pytest.approx(1.3976, abs=1e-4)
@@ -123,7 +123,7 @@ def assert_close(actual: Array, expected: Array, rounding: float = 0.0) -> None:
 
 @given(flocks(), st.sampled_from(['flocking', 'cucker_dong', 'cucker_smale']),
        st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.randoms(use_true_random=False))
-def test_law_moves_turns_and_permutes_with_the_flock_and_sums_to_zero(
+def test_law_is_equivariant_and_sums_to_zero(
         flock: tuple[Array, Array], model: Any, vector: tuple[float, float, float],
         random: Any) -> None:
     x, v = flock
@@ -192,7 +192,7 @@ def test_coincident_and_far_agents_get_finite_accelerations(theta: float) -> Non
         assert np.all(np.isfinite(accelerations(x, v, params)))
 
 
-def test_equal_velocities_and_an_agent_alone_give_no_acceleration() -> None:
+def test_equal_velocities_or_single_agent_give_no_acceleration() -> None:
     x = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])  # outside the band
     assert np.array_equal(accelerations(x, np.ones((2, 3)), FLIGHT), np.zeros((2, 3)))
     assert np.array_equal(acceleration(np.zeros((0, 3)), np.zeros((0, 3)), FLIGHT), np.zeros(3))
@@ -200,7 +200,7 @@ def test_equal_velocities_and_an_agent_alone_give_no_acceleration() -> None:
 
 
 @pytest.mark.parametrize('theta', [1.0, 1.5, 2.0, 3.0])
-def test_lyapunov_function_is_positive_falls_and_is_infinite_outside(theta: float) -> None:
+def test_lyapunov_function_is_positive_falls_infinite_outside(theta: float) -> None:
     params = FlockingParams(theta=theta)
     w = simulate(*LEADERLESS_START, params, duration=2.0, sample_period=0.01).metrics.lyapunov
     assert np.all(w > 0.0)

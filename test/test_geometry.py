@@ -39,12 +39,12 @@ def test_north_in_enu_is_the_first_ned_axis_and_up_is_minus_down():
 
 @pytest.mark.parametrize(
     'enu, ned', [(0.0, math.pi / 2), (math.pi / 2, 0.0), (math.pi, -math.pi / 2)])
-def test_yaw_from_east_anticlockwise_becomes_yaw_from_north_clockwise(enu, ned):
+def test_enu_yaw_becomes_ned_yaw(enu, ned):
     assert math.isclose(geo.yaw_enu_to_ned(enu), ned, abs_tol=1e-12)
 
 
 @given(vectors, angles, quaternions)
-def test_vectors_yaw_and_attitude_survive_the_round_trip_between_enu_and_ned(v, yaw, q):
+def test_vectors_yaw_attitude_survive_enu_ned_round_trip(v, yaw, q):
     np.testing.assert_array_equal(geo.ned_to_enu(geo.enu_to_ned(v)), v)
     np.testing.assert_array_equal(geo.frd_to_flu(geo.flu_to_frd(v)), v)
     assert abs(geo.wrap_angle(geo.yaw_ned_to_enu(geo.yaw_enu_to_ned(yaw)) - yaw)) < 1e-9
@@ -53,7 +53,7 @@ def test_vectors_yaw_and_attitude_survive_the_round_trip_between_enu_and_ned(v, 
 
 
 @given(quaternions, vectors)
-def test_attitude_in_ned_takes_the_same_body_vector_to_the_same_place(q, v):
+def test_ned_attitude_takes_body_vector_to_same_place(q, v):
     in_enu = geo.quaternion_to_matrix(q) @ v
     in_ned = geo.quaternion_to_matrix(geo.quaternion_enu_flu_to_ned_frd(q)) @ geo.flu_to_frd(v)
     np.testing.assert_allclose(in_ned, geo.enu_to_ned(in_enu), atol=1e-9)
@@ -68,7 +68,7 @@ def test_matrices_are_rotations_and_round_trip(q):
 
 
 @given(quaternions, quaternions, vectors)
-def test_a_quaternion_product_rotates_like_the_product_of_matrices(q1, q2, v):
+def test_quaternion_product_rotates_like_matrix_product(q1, q2, v):
     product = geo.quaternion_to_matrix(geo.quaternion_multiply(q1, q2))
     np.testing.assert_allclose(
         product @ v, geo.quaternion_to_matrix(q1) @ geo.quaternion_to_matrix(q2) @ v, atol=1e-9)

@@ -75,7 +75,7 @@ def test_a_recipe_takes_every_argument_and_has_its_own_topics(recipe: str) -> No
     (CAMERA, 'recipe:=t265', 'v_maxx:=1.0', 'did you mean v_max'),
     ('simulation.launch.py', 'v_max:=1.0', 'connection:=tcp:a:1', ''),
     ('flock.launch.py', 'followers:=3', 'namespace:=x', '')])
-def test_an_unknown_argument_is_refused_with_the_name_that_is_nearest(
+def test_unknown_argument_is_refused_with_nearest_name(
         monkeypatch: pytest.MonkeyPatch, file: str, valid: str, wrong: str, hint: str) -> None:
     def load(*command_line: str) -> None:
         monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', *command_line])
@@ -87,7 +87,7 @@ def test_an_unknown_argument_is_refused_with_the_name_that_is_nearest(
         load('flock_follower', file, valid, wrong)
 
 
-def test_nodes_are_started_by_choice_again_and_with_the_command_given() -> None:
+def test_nodes_are_started_by_choice_and_with_given_command() -> None:
     nodes, _ = launched(FOLLOWER)
     assert all(node.respawn and 0.0 < node.respawn_delay < 3.0 for node in nodes.values())
     nodes, _ = launched(FOLLOWER, visualize='true', record='false', respawn='false',
@@ -132,7 +132,7 @@ def config(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize('name', ['follower.yaml', 'neighbors.yaml', 'two_cameras.yaml'])
 @pytest.mark.parametrize('fault', ['missing', 'unreadable', 'a folder', 'no YAML'])
-def test_a_parameter_file_is_refused_by_name_never_replaced_by_defaults(
+def test_parameter_file_is_refused_by_name_not_replaced(
         config: Path, name: str, fault: str) -> None:
     path = config / name
     arguments = {'config': str(config), 'cameras': str(config / 'two_cameras.yaml')}
@@ -155,7 +155,7 @@ def test_a_parameter_file_is_refused_by_name_never_replaced_by_defaults(
     ('v_max', '-1.0', 'v_max = -1.0: must be'), ('camera_rpy', '[0.0]', 'camera_rpy = '),
     ('image_transport', 'jpg', "image_transport = 'jpg': must be one of"),
     ('target_system', '300', 'target_system = 300: must be')])
-def test_a_value_that_no_node_takes_ends_the_launch_instead_of_starting_nodes_for_ever(
+def test_value_that_no_node_takes_ends_launch_without_respawn(
         argument: str, text: str, said: str) -> None:
     with pytest.raises(ValueError, match=re.escape(said)):
         launched(FOLLOWER, **{argument: text})
@@ -181,7 +181,7 @@ def test_what_would_end_a_node_at_each_start_ends_the_launch(
         launched(FOLLOWER, config=str(config), namespace='mine', **given)
 
 
-def test_an_argument_left_empty_leaves_its_parameter_to_the_files(config: Path) -> None:
+def test_empty_argument_leaves_parameter_to_files(config: Path) -> None:
     own, two = str(config / 'follower.yaml'), str(config / 'two_cameras.yaml')
     nodes, _ = launched(FOLLOWER, config=str(config), cameras=two)
     neighbors = str(config / 'neighbors.yaml')
@@ -231,7 +231,7 @@ def test_an_invalid_value_is_refused(file: str, argument: str, text: str, valid:
         launched(file, **{argument: text})
 
 
-def test_detector_launch_starts_perception_alone_without_odometry() -> None:
+def test_detector_launch_starts_perception_without_odometry() -> None:
     nodes, _ = launched('detector.launch.py', image='/cam/image', camera_info='/cam/info',
                         namespace='lab')
     assert nodes.keys() == {'relative_pose'}

@@ -35,13 +35,13 @@ def make(*arguments):
 
 
 @pytest.mark.parametrize('version', ['3', '4', '4.6', '5.0', ''])
-def test_a_version_of_opencv_that_has_no_lock_is_refused_with_those_that_have(version):
+def test_opencv_version_without_lock_is_refused_with_choices(version):
     ended = make('test', f'VISION={version}')
     assert ended.returncode == 2
     assert f'VISION = {version}: must be 5 or 4.10.  Stop.' in ended.stderr
 
 
-def test_a_distribution_of_ros_that_has_no_lock_is_refused_with_those_that_have():
+def test_ros_distribution_without_lock_is_refused_with_choices():
     ended = make('test', 'ROS=lyrical')
     assert ended.returncode == 2
     assert 'ROS = lyrical: must be jazzy or kilted.  Stop.' in ended.stderr

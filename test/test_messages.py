@@ -90,7 +90,7 @@ def test_odometry_survives_the_round_trip(new: Make) -> None:
 
 @BOTH
 @pytest.mark.parametrize('twist_frame', ['child', 'odom'])
-def test_a_state_becomes_a_message_whose_twist_is_in_the_child_frame(
+def test_state_becomes_message_with_twist_in_child_frame(
         new: Make, twist_frame: str) -> None:
     q = quaternion_from_rpy(0.1, -0.2, 2.0)
     state = from_odometry(odometry(

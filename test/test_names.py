@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import ast
+from pathlib import Path
 
 import names
 import pytest
@@ -73,3 +74,11 @@ def test_the_list_of_accepted_breaches_may_only_shrink() -> None:
     assert names.compare({'a.py': {one}}, {'a.py': {one}}) == []
     new, gone = names.compare({'a.py': {one}}, {'a.py': {other}})
     assert new == 'a.py: word: FAR' and gone.startswith('a.py: function: at is mended: ')
+
+
+def test_a_long_name_of_a_test_is_a_breach(tmp_path: Path) -> None:
+    for folder in names.FOLDERS:
+        (tmp_path / folder).mkdir()
+    long = 'test_' + 'x' * names.MAX_TEST_NAME
+    (tmp_path / 'test' / 'test_it.py').write_text(f'def {long}():\n    pass\n')
+    assert names.find_breaches(tmp_path) == {'test/test_it.py': {('length', long)}}

@@ -63,7 +63,7 @@ def test_a_whole_number_is_no_float(value: Any) -> None:
         COUNT.check('system_id', value)
 
 
-def test_infinity_is_never_valid_and_large_bounds_keep_their_digits() -> None:
+def test_infinity_is_never_valid_large_bounds_keep_digits() -> None:
     assert not Range().holds(math.inf) and Range().holds(-1e300)
     assert str(Range()) == 'a finite number'
     assert str(Range(0.0, unit='m')) == 'a number in [0, inf) m'

@@ -230,7 +230,7 @@ def test_a_node_that_flies_loads_only_the_libraries_it_may(node):
 
 
 @pytest.mark.parametrize('node', FLIES)
-def test_a_node_that_flies_loads_no_checks_and_bags_and_no_table_but_its_own(node):
+def test_flight_node_loads_no_checks_bags_or_foreign_tables(node):
     rooms = {HOUSE[name].room for name in loaded(f'flock_follower.nodes.{node}')}
     assert not rooms & {'checks', 'bags', 'flight_parameters'}
     assert rooms & {'gate', 'mavlink', 'perception'} == {
@@ -249,7 +249,7 @@ def test_the_law_loads_geometry_and_ranges_alone():
 
 @pytest.mark.ros
 @pytest.mark.parametrize('node', FLIES)
-def test_a_node_that_flies_starts_without_the_libraries_of_others(node):
+def test_flight_node_starts_without_libraries_of_others(node):
     missing = {'cv2', 'pymavlink', 'rosbags', 'mcap', 'scipy', 'matplotlib'} - {
         *FLIES[node].split()}
     code = (f'import sys; sys.modules.update(dict.fromkeys({sorted(missing)}));'

@@ -31,7 +31,7 @@ BUSY = Run(1, Status(9, 9, 2, ('a', 'b')))
 @pytest.mark.parametrize(('ended', 'alone', 'code'), [
     ([GREEN, GREEN], [], 0), ([GREEN, RED], [GREEN], 1), ([GREEN, BUSY], [GREEN], 0),
     ([GREEN, BUSY], [BUSY], 3), ([GREEN, BUSY], [RED], 1), ([RED, BUSY], [BUSY], 1)])
-def test_only_a_pass_alone_makes_a_failure_on_a_busy_machine_green(
+def test_only_a_pass_alone_turns_a_busy_failure_green(
         ended: list[Run], alone: list[Run], code: int) -> None:
     assert verdict(ended, alone) == code
 
@@ -55,7 +55,7 @@ def test_the_status_is_what_a_run_of_tests_wrote(tmp_path: Path) -> None:
     assert read_status(path) == Status(3, 2, 1, ('a::b',))
 
 
-def test_a_run_keeps_what_it_compiles_whatever_it_is_started_with(
+def test_run_keeps_compiled_files_however_it_is_started(
         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PYTHONDONTWRITEBYTECODE', '1')
     monkeypatch.setenv('LANG', 'C')
@@ -64,7 +64,7 @@ def test_a_run_keeps_what_it_compiles_whatever_it_is_started_with(
     assert (given['LANG'], given[STATUS]) == ('C', 'status.json')
 
 
-def test_a_run_counts_each_test_once_and_names_those_of_a_busy_machine(tmp_path: Path) -> None:
+def test_run_counts_each_test_once_and_names_busy_ones(tmp_path: Path) -> None:
     path = tmp_path / 'status.json'
     counted = Progress(str(path))
     counted.pytest_xdist_node_collection_finished(None, ['a', 'b', 'c'])

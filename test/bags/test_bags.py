@@ -122,7 +122,7 @@ def error_of(path):
     return str(caught.value)
 
 
-def test_what_is_written_is_read_from_the_folder_and_from_the_bare_file(tmp_path):
+def test_written_data_is_read_from_folder_and_bare_file(tmp_path):
     imu = example(typestore(), 'sensor_msgs/msg/Imu')
     with BagWriter(tmp_path / 'flight', latched=['mode']) as bag:
         bag.write('mode', STRING, START, string('hover'))
@@ -232,7 +232,7 @@ def test_ros1_messages_become_their_ros2_type_field_by_field(tmp_path, msgtype):
         '/range': f'type {RANGE} has other fields in ROS 2 Jazzy'}),  # ROS 2 has one more
     ([ANIMAL], None, {'/animal': f'type {ANIMAL} does not exist in ROS 2 Jazzy'}),
     ([STRING, BOOL], '/mixed', {'/mixed': f'several types on one topic ({BOOL}, {STRING})'})])
-def test_ros1_topics_that_cannot_be_read_are_skipped_with_the_reason(
+def test_unreadable_ros1_topics_are_skipped_with_reason(
         tmp_path, msgtypes, topic, skipped):
     types = get_typestore(Stores.ROS1_NOETIC)
     types.register(get_types_from_msg('float32 size', ANIMAL))
@@ -249,7 +249,7 @@ def test_ros1_topics_that_cannot_be_read_are_skipped_with_the_reason(
             list(bag.messages(['/animal']))
 
 
-def test_custom_ros2_types_pass_undecoded_and_are_unknown_only_when_decoded(tmp_path):
+def test_custom_ros2_types_pass_undecoded_fail_decoded(tmp_path):
     types, data = get_typestore(Stores.EMPTY), b'\x00\x01\x00\x00\x00\x00\x80\x3f'
     types.register(get_types_from_msg('float32 size', ANIMAL))
     with Rosbag2Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -260,7 +260,7 @@ def test_custom_ros2_types_pass_undecoded_and_are_unknown_only_when_decoded(tmp_
         deserialize(message.data, message.msgtype)
 
 
-def test_a_missing_bag_an_unknown_format_and_an_empty_one_are_one_line(tmp_path):
+def test_missing_bag_unknown_format_and_empty_bag_are_one_line(tmp_path):
     assert error_of(tmp_path / 'none').endswith('none: no such bag')
     (tmp_path / 'notes.txt').write_text('hello')
     assert 'notes.txt: unknown format: must be .bag, .mcap, .db3' in error_of(
@@ -326,7 +326,7 @@ def test_damage_is_noticed_in_one_line(tmp_path):
                 error_of(file)
 
 
-def test_damaged_messages_raise_a_bag_error_and_pixels_are_not_copied():
+def test_damaged_messages_raise_bag_error_pixels_not_copied():
     rng = np.random.default_rng(1)
     for msgtype in ('nav_msgs/msg/Odometry', 'sensor_msgs/msg/Image'):
         good = serialize(example(typestore(), msgtype), msgtype)

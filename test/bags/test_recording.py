@@ -128,7 +128,7 @@ def test_every_write_is_on_the_disk_when_it_returns(
     ((second(100), second(0)), [[*range(1000, 1010)], [*range(10)]]),  # the clock was set
     ((second(-1_600_000_000), second(1)), [[*range(-16_000_000_000, -15_999_999_990)],
                                            [*range(10, 20)]])])
-def test_messages_out_of_order_are_put_in_order_or_begin_another_recording(
+def test_unordered_messages_are_ordered_or_begin_new_recording(
         tmp_path: Path, writes: Sequence[list[TakenMessage]], recordings: list[list[int]]) -> None:
     box = FlightRecording(tmp_path, *LIMITS)
     for now, messages in enumerate(writes):
@@ -182,7 +182,7 @@ def test_the_oldest_files_make_way_but_none_of_the_newest(
     assert len(numbers(path)) == 400
 
 
-def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
+def test_little_disk_room_costs_oldest_files_then_recording(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     used_by_others = 0.0
 
@@ -207,7 +207,7 @@ def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
 
 
 @pytest.mark.parametrize('size', [20_000, 20_050])
-def test_a_full_disk_keeps_what_was_written_and_recording_goes_on_when_there_is_room(
+def test_full_disk_keeps_written_data_and_recording_resumes(
         tmp_path: Path, size: int) -> None:
     box = FlightRecording(tmp_path, *LIMITS)
     done = 0
@@ -239,7 +239,7 @@ def recorded(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
 Recorded = tuple[Path, list[BagMessage]]
 
 
-def test_a_recording_cut_anywhere_opens_as_far_as_it_goes_or_reports_that_it_holds_nothing(
+def test_recording_cut_anywhere_opens_or_reports_it_is_empty(
         recorded: Recorded) -> None:
     path, messages = recorded
     file = next(path.glob('*.mcap'))

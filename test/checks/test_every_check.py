@@ -514,7 +514,7 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
     (0.2, 0.0, False, 0, 'ready to fly'), (0.2, 0.3, False, 0, 'ready to fly'),
     (0.7, 0.0, False, 3, 'too busy: for 70% of the worst 2 s'),
     (0.7, 0.3, True, 1, 'not ready to fly'), (0.01, 0.3, False, 1, 'not ready to fly')])
-def test_the_exit_code_is_3_if_only_a_busy_computer_prevents_a_flight(
+def test_exit_code_is_3_only_if_busy_computer_prevents_flight(
         monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], load: float,
         late: float, fault: bool, code: int, last: str) -> None:
     seen = healthy(True)
@@ -589,7 +589,7 @@ def test_one_cause_has_one_row() -> None:
     assert not {'marker size', 'camera mounting', 'camera time offset'} & rows(seen).keys()
 
 
-def test_faults_of_the_recorded_nodes_do_not_spoil_a_bag_but_too_few_messages_do() -> None:
+def test_faults_of_recorded_nodes_do_not_spoil_a_bag() -> None:
     seen = healthy(live=False)
     seen.statuses = {'planner': NodeStatus(2, 'no /odom for 4 s: no publisher')}
     assert rows(seen)['planner status'] == WARNING and ready(seen.judged())

@@ -30,7 +30,7 @@ from flock_follower.checks.own_motion import check_mounting
     ((5.0, 3.0, 20.0), (1.0, 1.0, 9.0), WARNING, 'rolled right by 5 deg', 'yaw unknown'),
     ((1.0, 3.0, 20.0), (1.0, 2.0, 9.0), UNMEASURED, '', 'pitch, yaw unknown'),
     ((1.0, 3.0, 2.0), (1.0, 1.0, 1.0), OK, '', '')])
-def test_an_axis_beyond_its_margin_is_named_and_an_open_one_is_unknown(
+def test_axis_beyond_margin_is_named_open_one_is_unknown(
         turn: tuple[float, ...], deviations: tuple[float, ...], level: str, named: str,
         unknown: str) -> None:
     found = check_mounting(np.radians(turn), np.radians(deviations), [0.0, 0.0, 0.0])

@@ -99,7 +99,7 @@ def test_the_share_is_that_of_waiting_times_that_of_the_others(kernel: Kernel) -
     assert '(1.5 of 2 processors)' in str(load)
 
 
-def test_other_programs_that_leave_a_processor_free_disturb_nobody(kernel: Kernel) -> None:
+def test_programs_that_leave_a_processor_free_disturb_none(kernel: Kernel) -> None:
     load = measured(kernel, 4.0, 1.0, p7_1=(0.5, 0.02))
     assert load is not None and load.others == pytest.approx(1.0, abs=0.02) and not load.busy
 
@@ -122,7 +122,7 @@ def test_one_busy_window_is_enough_and_those_before_do_not_count(kernel: Kernel)
     assert later is not None and later.share == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_new_thread_counts_from_its_start_and_one_that_ended_no_more(kernel: Kernel) -> None:
+def test_new_thread_counts_from_start_and_ended_one_no_more(kernel: Kernel) -> None:
     kernel.run(1.0, 0.0, p7_1=(0.1, 0.0), p7_2=(0.1, 0.9))
     meter = LoadMeter(lambda: [7], kernel.proc, (0, 1))
     meter.sample(kernel.time)

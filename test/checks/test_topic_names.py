@@ -49,7 +49,7 @@ def test_of_a_drivers_topics_the_likeliest_is_offered_first(name: str, there: st
     assert 'depth' not in reported and 'mavlink' not in reported
 
 
-def test_compressed_images_are_offered_under_their_name_and_depth_never() -> None:
+def test_compressed_images_are_offered_and_depth_never() -> None:
     assert offer('image_raw', {'/cam/image/compressed': COMPRESSED}).endswith(
         ': --remap image_raw/compressed:=/cam/image/compressed')
     assert offer('image_raw', {'/camera/depth/image': IMAGE}) == ''
@@ -88,7 +88,7 @@ def test_remaps_are_ours_first_as_in_ros() -> None:
             parse_remaps([wrong])
 
 
-def test_names_are_those_of_the_namespace_but_where_they_are_absolute() -> None:
+def test_names_are_in_namespace_unless_absolute() -> None:
     names = names_there('drone1', {'odom': '/vio/odom', 'camera_info': 'cam/info'})
     assert names['odom'] == '/vio/odom' and names['camera_info'] == '/drone1/cam/info'
     assert names['image_raw'] == full_name('image_raw', '/drone1/') == '/drone1/image_raw'

@@ -68,7 +68,7 @@ def test_the_programs_of_the_system_take_our_files(
     assert ended.stderr + ended.stdout == ''
 
 
-def test_the_unit_starts_in_any_order_ends_as_ctrl_c_does_and_keeps_ports_and_real_time() -> None:
+def test_unit_starts_in_any_order_and_ends_as_ctrl_c_does() -> None:
     said = keys(UNIT)
     assert not {'Requires', 'BindsTo', 'Requisite', 'After', 'Wants'} & said.keys()
     assert said['Restart'] == ['always'] and said['StartLimitIntervalSec'] == ['0']
@@ -96,7 +96,7 @@ def test_the_example_gives_arguments_that_the_launch_file_has() -> None:
                ) <= int(keys(UNIT)['LimitRTPRIO'][0])
 
 
-def test_the_device_of_the_udev_rule_is_the_one_that_is_named_elsewhere() -> None:
+def test_udev_rule_device_is_the_one_named_elsewhere() -> None:
     rules = (DEPLOY / '61-flight-controller.rules').read_text()
     (link,) = set(re.findall(r'SYMLINK\+="([^"]+)"', rules))
     connection = dict(word.split(':=') for word in example()['LAUNCH_ARGUMENTS'].split())

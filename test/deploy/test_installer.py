@@ -66,7 +66,7 @@ def test_it_prints_and_writes_its_files_and_undoes_them(tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: Path) -> None:
+def test_changed_settings_outlive_update_and_undo(tmp_path: Path) -> None:
     install(tmp_path)
     (tmp_path / SETTINGS).write_text('WORKSPACE=/mine\n')
     for arguments in ([], ['--undo']):

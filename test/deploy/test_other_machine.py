@@ -131,7 +131,7 @@ def machines(tmp_path: Path) -> Iterator[Machines]:
 
 
 @pytest.mark.ros
-def test_an_engage_from_another_machine_arrives_only_where_ros_is_left_open(
+def test_engage_from_other_machine_needs_open_ros_network(
         machines: Machines) -> None:
     assert CLOSED['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
     machines.follower('closed', CLOSED)

@@ -100,7 +100,7 @@ def test_the_one_command_starts_what_is_named(monkeypatch: pytest.MonkeyPatch,
         assert text in ''.join(capsys.readouterr())
 
 
-def test_what_package_xml_asks_for_is_in_the_extra_and_not_required(
+def test_dependencies_of_package_xml_are_in_extra_not_required(
         monkeypatch: pytest.MonkeyPatch) -> None:
     said = setup(monkeypatch)
     assert said['install_requires'] == ['setuptools']

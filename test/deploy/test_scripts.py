@@ -45,7 +45,7 @@ def workspace(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_launch_file_and_its_arguments_are_those_of_the_settings(workspace: Path) -> None:
+def test_launch_file_and_arguments_are_those_of_settings(workspace: Path) -> None:
     ended = start(workspace, LAUNCH_FILE='camera.launch.py', LAUNCH_ARGUMENTS=(
         "recipe:=t265 odom:=/vio/odom camera_rpy:='[0.0, 0.2, 0.0]'  "
         "bridge_prefix:='taskset -c 3'"))
@@ -78,7 +78,7 @@ def test_without_a_place_for_logs_it_starts_with_a_warning(workspace: Path) -> N
         assert f'ROS_LOG_DIR = {folder}' in ended.stderr
 
 
-def test_a_workspace_that_is_not_built_is_named_with_the_file_that_says_so(tmp_path: Path) -> None:
+def test_unbuilt_workspace_is_named_with_its_file(tmp_path: Path) -> None:
     ended = start(tmp_path)
     assert ended.returncode == 1
     assert f'WORKSPACE = {tmp_path} in /etc/flock_follower/drone.env' in ended.stderr

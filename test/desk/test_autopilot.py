@@ -48,7 +48,7 @@ def state(flight):
     return flight.controller.mode, flight.controller.in_failsafe
 
 
-def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
+def test_vehicle_tilts_with_acceleration_after_attitude_lag():
     vehicle, tilts = Quadrotor((0, 0, 2), yaw=math.pi / 2), []
     vehicle.steer([1.0, 0.0, 0.0], math.pi / 2)
     for _ in range(100):
@@ -89,7 +89,7 @@ def test_setpoints_px4_would_drop_do_not_count_as_a_stream(dropped):
     assert flight.mode('OFFBOARD') == [0, 1]
 
 
-def test_disarmed_any_mode_may_be_chosen_and_arming_asks_for_the_stream():
+def test_disarmed_any_mode_may_be_chosen_arming_needs_stream():
     flight = Flight(start='landed')
     assert flight.mode('OFFBOARD') == [0, 0] and flight.arm() == [1]
     assert flight.controller.system_status == mavlink.MAV_STATE_UNINIT
@@ -100,7 +100,7 @@ def test_disarmed_any_mode_may_be_chosen_and_arming_asks_for_the_stream():
     assert flight.arm() == [1] and flight.controller.mode == 'AUTO.LAND'
 
 
-def test_after_landing_the_mode_from_before_is_back_and_does_not_arm():
+def test_mode_from_before_is_back_after_landing_without_arming():
     flight = Flight()
     offboard(flight, setpoint())
     assert flight.mode('AUTO.LAND') == [0, 0]
@@ -126,7 +126,7 @@ def test_the_last_setpoint_is_kept_until_the_stream_is_lost(action, mode):
         assert not flight.controller.armed and flight.vehicle.landed
 
 
-def test_setpoints_alone_end_the_failsafe_and_a_mode_that_is_chosen_ends_it_for_good():
+def test_setpoints_end_failsafe_and_chosen_mode_ends_it_for_good():
     flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
     offboard(flight, setpoint())
     flight.fly(1.5)
@@ -148,7 +148,7 @@ def aloft():
     return flight
 
 
-def test_px4_without_an_origin_stays_in_its_take_off_until_it_gets_one():
+def test_px4_without_origin_stays_in_take_off_until_it_has_one():
     flight = aloft()
     assert flight.controller.mode == 'AUTO.TAKEOFF'
     assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
@@ -163,7 +163,7 @@ def test_px4_without_an_origin_stays_in_its_take_off_until_it_gets_one():
     assert flight.controller.mode == 'AUTO.LOITER'
 
 
-def test_px4_without_a_position_falls_back_until_something_can_be_flown():
+def test_px4_without_position_falls_back_to_a_flyable_mode():
     flight = aloft()
     flight.send(setpoint())
     flight.mode('OFFBOARD')
@@ -192,7 +192,7 @@ def test_px4_shows_a_change_of_the_mode_in_its_stream(rate, least, most):
 
 
 @pytest.mark.parametrize(('above_home', 'reached'), [(4.0, 4.0), (-400.0, 2.5)])
-def test_px4_takes_the_altitude_as_above_sea_level_and_raises_one_that_is_too_low(
+def test_px4_altitude_is_above_sea_and_raised_if_too_low(
         above_home, reached):
     flight = Flight(start='landed')
     flight.ask('GLOBAL_POSITION_INT')
@@ -259,7 +259,7 @@ def test_the_landed_state_shows_a_flight(personality):
 
 @pytest.mark.parametrize(('personality', 'message', 'result'), [
     ('px4', 'HEARTBEAT', 4), ('px4', 'EKF_STATUS_REPORT', 4), ('arducopter', 'CURRENT_MODE', 2)])
-def test_the_rate_of_a_message_is_refused_as_the_real_one_refuses_it(
+def test_message_rate_is_refused_as_by_real_autopilot(
         personality, message, result):
     assert Flight(personality).ask(message) == [result]
 

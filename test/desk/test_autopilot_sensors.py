@@ -66,7 +66,7 @@ def test_the_estimate_follows_the_vision_even_if_it_is_wrong(personality):
         math.pi / 2 - flight.vehicle.yaw - 0.5, abs=0.05)
 
 
-def test_a_jump_is_an_outlier_unless_the_reset_counter_announces_it():
+def test_jump_is_outlier_unless_reset_counter_announces_it():
     flight, away = Flight(parameters=BLIND['px4']), np.array([5.0, 0.0, 0.0])
     flight.fly(1.0, seen(flight), rate=30.0)
     flight.fly(0.5, seen(flight, error=away), rate=30.0)
@@ -78,7 +78,7 @@ def test_a_jump_is_an_outlier_unless_the_reset_counter_announces_it():
 @pytest.mark.parametrize(('personality', 'synchronized', 'age', 'used'), [
     ('px4', True, 0.05, True), ('px4', True, 0.5, False), ('px4', True, -1.0, False),
     ('px4', False, 0.5, True), ('arducopter', True, 0.5, True)])
-def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learned(
+def test_px4_uses_no_vision_that_is_old_by_its_clock(
         personality, synchronized, age, used):
     flight = Flight(personality, start='landed', parameters=BLIND[personality])
     flight.fly(0.01)
@@ -102,7 +102,7 @@ def test_without_vision_the_velocity_is_sent_on_and_drifts(personality, seconds,
     assert math.hypot(sent.vy - true[0], sent.vx - true[1]) == pytest.approx(error, rel=0.1)
 
 
-def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():
+def test_arducopter_lands_after_seconds_without_vision():
     flight = Flight('arducopter', altitude=20.0, parameters=BLIND['arducopter'])
     flight.fly(1.0, seen(flight))
     flight.mode('GUIDED')
@@ -116,7 +116,7 @@ def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():
     assert flight.controller.mode == 'LAND' and not flight.controller.in_failsafe
 
 
-def test_the_barometer_measures_the_true_height_with_noise_and_drift():
+def test_barometer_measures_height_with_noise_and_drift():
     flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3})
     assert flight.ask('SCALED_PRESSURE') == [0]
     flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)

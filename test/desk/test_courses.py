@@ -72,7 +72,7 @@ def test_a_circle_is_round_and_a_figure_eight_crosses_itself() -> None:
     assert np.abs(eight[:, 0] - eight[0, 0]).max() == pytest.approx(2.0, abs=0.02)
 
 
-def test_heading_is_fixed_along_the_course_or_away_no_faster_than_a_pilot_turns() -> None:
+def test_heading_follows_course_or_away_at_a_pilots_rate() -> None:
     c = flown(replace(MOTIONS['circle'], heading='course'))
     moving = c.velocities[1200:]
     assert c.headings[1200:] == pytest.approx(np.arctan2(moving[:, 1], moving[:, 0]))
@@ -88,7 +88,7 @@ def test_heading_is_fixed_along_the_course_or_away_no_faster_than_a_pilot_turns(
 
 
 @pytest.mark.parametrize('name', RANDOM)
-def test_random_courses_differ_and_keep_speed_climb_acceleration_and_height(name: str) -> None:
+def test_random_courses_differ_and_keep_their_limits(name: str) -> None:
     scenario = load(name)
     motion, courses = scenario.leader, [course(scenario, run) for run in range(8)]
     for c in courses:
@@ -103,7 +103,7 @@ def test_random_courses_differ_and_keep_speed_climb_acceleration_and_height(name
     assert not np.array_equal(courses[3].positions, courses[4].positions)
 
 
-def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run() -> None:
+def test_gusts_have_their_size_and_wind_its_own_direction() -> None:
     calm = wind_course(Wind((2.0, 2.0), 0.0), 100, 0.05, np.random.default_rng(1))
     assert np.linalg.norm(calm, axis=1) == pytest.approx(2.0)
     assert not calm[:, 2].any()
@@ -116,7 +116,7 @@ def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run()
 
 @pytest.mark.parametrize('formation', FORMATIONS)
 @pytest.mark.parametrize('count', [1, 4, 19])
-def test_in_a_formation_all_keep_their_spacing_and_each_faces_the_one_ahead(
+def test_formation_keeps_spacing_and_each_faces_the_one_ahead(
         formation: str, count: int) -> None:
     found = places(Flock(count, formation, spacing=1.8))
     points = np.array([np.zeros(3), *(place.offset for place in found)])

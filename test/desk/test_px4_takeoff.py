@@ -74,7 +74,7 @@ def test_a_take_off_climbs_along_a_ramp():
     assert flight.vehicle.position[2] > 2.0
 
 
-def test_px4_that_touches_the_ground_in_offboard_does_not_count_as_landed():
+def test_px4_touching_ground_in_offboard_is_not_landed():
     flight = armed_on_the_ground()
     flight.fly(3.0, setpoint(0.0, 0.0, 0.5))
     assert flight.vehicle.position[2] > 1.0
@@ -88,7 +88,7 @@ def test_px4_that_touches_the_ground_in_offboard_does_not_count_as_landed():
     assert flight.controller.landed_state == ON_GROUND
 
 
-def test_braking_by_noisy_odometry_on_the_ground_does_not_move_arducopter():
+def test_braking_by_noise_on_ground_does_not_move_arducopter():
     flight = armed_on_the_ground('arducopter')
     flight.fly(15.0, braking(0.02))
     assert flight.vehicle.position[2] == 0.0 and flight.vehicle.thrust < 2.0

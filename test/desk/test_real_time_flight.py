@@ -110,7 +110,7 @@ def test_the_scenario_begins_once_engaged_in_offboard_mode(camera):
     assert waiting.flight.time == pytest.approx(0.5, abs=0.011)
 
 
-def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(camera):
+def test_images_come_at_30_hz_late_by_remaining_latency(camera):
     frames = Commanded(camera).fly(1.0).frames
     assert len(frames) in (29, 30)
     stamps = np.array([f.stamp_ns for f in frames])
@@ -125,7 +125,7 @@ def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(c
     assert late.skipped_images == 6  # those of the first 0.2 s
 
 
-def test_the_image_shows_the_marker_where_truth_camera_and_mounting_put_it(camera):
+def test_image_shows_marker_at_truth_camera_and_mounting(camera):
     motion = LeaderMotion(motion='circle', wait=0.0, speed=(0.5, 0.5), size=1.0)
     flown = Commanded(camera, (0.2, -0.1, 0.05), yaw=-0.1, leader=motion).fly(2.0)
     k = calibration(camera.camera)
@@ -159,7 +159,7 @@ def test_outages_silence_odometry_and_hide_the_leader(camera):
         assert frame.usable == (not (1.2 <= time < 1.6 or 0.5 <= time < 0.9))
 
 
-def test_light_changes_hide_the_marker_for_as_long_as_the_scenario_says():
+def test_light_changes_hide_marker_as_long_as_scenario_sets():
     changing = ScenarioRun(scenario(sensing=Sensing(light_changes=30.0)), 3)
     assert len(changing.light_changes) > 3
     for begin, end in changing.light_changes:
@@ -167,7 +167,7 @@ def test_light_changes_hide_the_marker_for_as_long_as_the_scenario_says():
     assert not any(ScenarioRun(scenario(), 3).hides(0.1 * k) for k in range(200))
 
 
-def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pose():
+def test_leader_tilts_with_acceleration_twist_fits_pose():
     motion = LeaderMotion(motion='circle', wait=0.0, speed=(1.0, 1.0), size=1.5, heading='course')
     live, time, h = ScenarioRun(scenario(leader=motion), 1), 9.0, 0.01
     before, state, after, opposite = (live.motion(0, t) for t in (
@@ -255,7 +255,7 @@ class Elsewhere:
         return self.fly(seconds, engaged).frames[-1]
 
 
-def test_the_leader_comes_to_the_follower_with_each_offboard_mode_until_the_scenario_begins(
+def test_leader_reaches_follower_with_each_mode_before_start(
         camera):
     flown = Elsewhere(camera).fly(1.5)
     assert math.isnan(flown.flight.distance)
@@ -289,7 +289,7 @@ def test_without_poses_no_image_and_no_odometry_is_invented(camera):
         [0.0, 0.2, 0.0], abs=0.01)
 
 
-def test_a_leader_elsewhere_is_where_it_reports_and_the_scenarios_does_not_fly(camera):
+def test_external_leader_is_at_its_report_scenario_leader_absent(camera):
     flown = Elsewhere(camera, led=True).fly(1.5)
     assert flown.distances[-1] == pytest.approx(2.15, abs=0.02)
     flown.offboard(True, 1.0, engaged=True)

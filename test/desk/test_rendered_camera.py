@@ -84,7 +84,7 @@ def live():
 
 @pytest.mark.parametrize('camera', [Camera(), FISHEYE, WIDE],
                          ids=['plumb_bob', 'equidistant', 'very wide'])
-def test_points_are_seen_where_opencv_projects_them_and_rays_are_the_inverse(camera):
+def test_points_match_opencv_projection_rays_are_its_inverse(camera):
     u, v = np.meshgrid(np.linspace(50, 160, 33), np.linspace(50, 150, 25))
     rays = camera.rays(u, v)
     pixels = project(camera, np.stack([*rays, np.ones_like(u)], axis=-1))
@@ -94,7 +94,7 @@ def test_points_are_seen_where_opencv_projects_them_and_rays_are_the_inverse(cam
     np.testing.assert_allclose(camera.project(points), project(camera, points), atol=1e-9)
 
 
-def test_a_point_far_beside_the_view_stays_beside_it_however_the_lens_folds():
+def test_point_far_outside_view_stays_outside_any_lens():
     folding = Camera(distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))  # r (1 - 0.3 r^2) falls from 1.05 on
     for aside in (-10.0, -2.0, -1.0, 1.0, 2.0, 10.0):
         u = folding.project(np.array([[aside, 0.0, 1.0]]))[0, 0]
@@ -109,7 +109,7 @@ def test_rays_of_a_very_wide_lens_end_at_its_image_circle():
     assert image[:9, :9].mean() < 40 and image[70:130, 70:140].mean() > 90
 
 
-def test_light_becomes_a_pixel_by_vignetting_gamma_and_noise_that_repeats_with_the_index():
+def test_light_becomes_pixel_by_vignetting_gamma_seeded_noise():
     sensor = Sensor(gamma=1.0, vignetting=0.0, gain=1.0, full_well=2000.0, read_noise=20.0)
     renderer = Renderer(STRAIGHT, sensor)
     for radiance in (0.1, 0.5):
@@ -128,7 +128,7 @@ def test_light_becomes_a_pixel_by_vignetting_gamma_and_noise_that_repeats_with_t
     assert image[0, 0] == pytest.approx(255 * light**(1 / 2.2), abs=1)
 
 
-def test_the_surroundings_move_against_the_turn_of_the_camera_and_have_no_seam(live):
+def test_surroundings_move_against_camera_turn_without_seam(live):
     def turned(heading):
         return live.radiance([Transform(rotation_vector_to_matrix([0.0, 0.0, heading]))
                               @ T_WORLD_OPTICAL], [])
@@ -139,7 +139,7 @@ def test_the_surroundings_move_against_the_turn_of_the_camera_and_have_no_seam(l
     np.testing.assert_allclose(turned(np.pi - 1e-7), turned(-np.pi + 1e-7), atol=1e-3)
 
 
-def test_the_poses_of_an_exposure_are_spread_about_its_stamp_and_count_alike(live):
+def test_poses_of_exposure_spread_about_stamp_weigh_alike(live):
     times = Sensor(exposure=0.02, sub_poses=10).times(5.0)
     assert [times.mean(), np.ptp(times)] == pytest.approx([5.0, 0.018])
     poses = [POSES['ahead'], POSES['far']]
@@ -156,7 +156,7 @@ def test_perception_finds_the_marker_where_it_is(live, pose):
     assert np.linalg.norm(off, axis=1).max() < 0.3
 
 
-def test_a_leader_is_seen_up_to_the_edge_of_the_view_and_not_from_behind_the_camera(live):
+def test_leader_is_seen_to_edge_of_view_and_not_behind_camera(live):
     empty = live.radiance([T_WORLD_OPTICAL], [])
     for place, shown in (((1.6, 0.75, 0.0), True), ((1.6, -0.75, 0.0), True),
                          ((1.6, 0.0, 0.55), True), ((1.6, 0.0, -0.55), True),
@@ -168,7 +168,7 @@ def test_a_leader_is_seen_up_to_the_edge_of_the_view_and_not_from_behind_the_cam
         assert any(edge.any() for edge in edges) == changed.any() == shown
 
 
-def test_only_the_tail_shows_the_marker_and_a_nearer_body_hides_it(live):
+def test_only_tail_shows_marker_and_nearer_body_hides_it(live):
     away = Transform(rotation_vector_to_matrix([0.0, 0.0, np.pi]), np.array([1.4, 0.0, 0.0]))
     hiding = Renderer(Camera(), Sensor(), prints=[(leader(BLACK), Transform(
         translation=np.array([1.0, 0.0, 0.0])))])

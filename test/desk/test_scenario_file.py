@@ -52,13 +52,13 @@ def test_the_package_has_these_scenarios() -> None:
 
 
 @pytest.mark.parametrize('name', names())
-def test_every_scenario_of_the_package_is_valid_and_says_what_it_is(name: str) -> None:
+def test_every_packaged_scenario_is_valid_and_described(name: str) -> None:
     scenario = load(name)
     assert scenario.name == name
     assert len(scenario.summary) > 10
 
 
-def test_a_file_of_ones_own_is_read_with_integers_and_single_values(tmp_path: Path) -> None:
+def test_own_file_is_read_with_integers_and_single_values(tmp_path: Path) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text(GOOD + 'wind: {speed: 2}\nduration: 30\n')
     scenario = load(str(path))

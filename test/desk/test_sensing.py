@@ -39,7 +39,7 @@ def turned(*degrees: float) -> np.ndarray:
                      for c, s in [(np.cos(angle), np.sin(angle))]])
 
 
-def test_noise_along_and_across_the_line_of_sight_has_the_documented_size() -> None:
+def test_noise_along_and_across_sight_has_documented_size() -> None:
     covariance = relative_noise(np.array([[1.2, 1.6, 0.0]]), PerceptionNoise())[0]
     along, across = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
     assert np.sqrt(along @ covariance @ along) == pytest.approx(0.0003 + 0.0003 * 4.0)
@@ -56,7 +56,7 @@ def test_the_camera_sees_vehicles_in_front_of_it(yaw: float) -> None:
         True, True, False, False, True, False, False]
 
 
-def test_each_camera_sees_its_side_and_four_wide_ones_see_all_round() -> None:
+def test_each_camera_sees_its_side_four_wide_ones_all_round() -> None:
     angles = np.radians(np.arange(0.0, 360.0, 2.0))
     circle = 2.0 * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     level, wide = turned(*[0.0] * len(circle)), PerceptionNoise(half_width=1.1, farthest=5.0)
@@ -85,7 +85,7 @@ def test_a_vehicle_between_hides_the_one_behind_it() -> None:
     assert not hidden(beside, there[:2], 0.25).any()
 
 
-def test_messages_arrive_late_in_the_own_flock_only_and_some_are_lost() -> None:
+def test_messages_arrive_late_in_own_flock_only_some_are_lost() -> None:
     radio = Radio[str](3, 0.25, 0.0, [np.random.default_rng(k) for k in range(6)])
     radio.send(1.0, 4, ['a', 'b'])
     assert radio.arrived(1.2) == []

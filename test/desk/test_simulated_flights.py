@@ -87,7 +87,7 @@ def speed(flights: Flights) -> Array:
     return np.linalg.norm(flights.velocity, axis=2)
 
 
-def test_without_odometry_it_flies_on_by_the_marker_and_returns_without_a_step() -> None:
+def test_flight_by_marker_without_odometry_returns_smoothly() -> None:
     scenario = sooner('vio_lost', 10.0)
     flown = fly(replace(scenario, duration=17.0, flight=replace(
         scenario.flight, relative_flight=True)), RUNS, True)
@@ -108,13 +108,13 @@ def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:
     assert guard['max_speed'].max() < 1.1 * scenario.flight.v_max
 
 
-def test_behind_a_hovering_leader_noise_carries_it_to_the_middle_of_the_band() -> None:
+def test_noise_behind_hovering_leader_leads_to_middle_of_band() -> None:
     scenario = load('hover_noisy')
     flights = fly(replace(scenario, duration=30.0, start=Start((2.4, 2.4))), range(1), False)
     assert measure(flights)['final_distance'] == pytest.approx(np.sqrt(4.5), abs=0.1)
 
 
-def test_an_unseen_leader_is_coasted_after_then_waited_for_and_followed_again() -> None:
+def test_unseen_leader_is_coasted_then_awaited_then_followed() -> None:
     flights = fly(replace(sooner('marker_lost_5s', 10.0), duration=19.0), RUNS, True)
     assert np.all(in_state(flights, State.TRACK)[:, during(flights, 1.5, 10.0)])
     held = during(flights, 12.2, 15.0)  # 2.1 s after the last image, and a tick
@@ -143,7 +143,7 @@ def test_a_second_print_is_kept_clear_of_and_never_followed() -> None:
     assert measure(flights)['max_separation'].max() < 3.5
 
 
-def test_a_leader_that_comes_while_odometry_is_lost_is_kept_clear_of() -> None:
+def test_leader_coming_while_odometry_is_lost_is_kept_clear_of() -> None:
     """The autopilot has a velocity of its own; the follower hovered, and was met within 0.2 m."""
     coming = LeaderMotion('legs', 2.0, acceleration=1.0, heading='away', legs=(
         Leg(4.0, (1.0, 0.0, 0.0)), Leg(9.0, (-1.06, 0.0, 0.0))))
@@ -172,7 +172,7 @@ def test_lost_odometry_is_braked_on_within_300_ms() -> None:
 
 @pytest.mark.parametrize(('descent', 'v_max'), [
     (1.0, 2.0), pytest.param(0.3, 0.5, marks=pytest.mark.sweep)])
-def test_behind_a_leader_that_lands_it_stops_at_the_least_altitude(descent: float,
+def test_behind_landing_leader_it_stops_at_altitude_min(descent: float,
                                                                    v_max: float) -> None:
     indoor = load('indoor')
     landing = replace(
@@ -193,7 +193,7 @@ def begins(flights: Flights, row: int) -> list[float]:
     return flights.times[np.diff(flights.obeying[row].astype(int), prepend=0) > 0].tolist()
 
 
-def test_a_handover_keeps_the_altitude_and_nothing_is_sent_unasked() -> None:
+def test_handover_keeps_altitude_and_sends_nothing_unasked() -> None:
     scenario = load('handover')
     # The pilot takes over 14 s earlier.
     flights = fly(replace(scenario, duration=33.0, operations=tuple(
@@ -212,7 +212,7 @@ def test_a_handover_keeps_the_altitude_and_nothing_is_sent_unasked() -> None:
     np.testing.assert_allclose(climbed, 3.5, atol=0.3)  # 2 m above the first altitude
 
 
-def test_a_bridge_that_starts_again_sends_nothing_before_offboard_is_called() -> None:
+def test_restarted_bridge_sends_nothing_before_offboard() -> None:
     scenario = load('restart')
     # The leader stops, the bridge dies and comes back 10 s earlier, offboard is called at 21 s.
     leg, rest = scenario.leader.legs
@@ -351,7 +351,7 @@ def test_ctrl_c_ends_the_flights_and_their_workers_at_once(tmp_path: Path) -> No
     assert not list(tmp_path.iterdir())
 
 
-def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
+def test_odometry_has_rate_and_latency_of_scenario():
     scenario = replace(load('hover'), odometry=VioErrors(rate=10.0, latency=(0.06, 0.06)),
                        # Nobody holds the altitude.
                        response=Response(thrust_error=0.0, odometry_delay=(0.0, 0.0)))

@@ -52,7 +52,7 @@ def test_a_run_is_the_same_alone_and_among_others() -> None:
     assert not np.array_equal(together.follower[0], together.follower[4])
 
 
-def test_in_a_line_each_follows_the_next_one_and_figures_are_along_those_edges() -> None:
+def test_line_members_follow_next_one_figures_along_edges() -> None:
     flights, runs = flown('short', [0])
     assert flights.shown.max() == 1 and flights.in_sight.all()
     assert np.all(flights.state[:, flights.times > 2.0] == STATES.index(State.TRACK))
@@ -89,7 +89,7 @@ def test_flocks_keep_apart_and_lose_nobody(name: str, run: int, changes: dict[st
     assert figures['time_in_band'].min() >= in_band
 
 
-def test_with_messages_a_ring_keeps_clear_of_a_leader_that_nobody_sees() -> None:
+def test_ring_with_messages_keeps_clear_of_unseen_leader() -> None:
     """In this run it strolled on to 0.25 m from one of the ring around it."""
     _, figures = flown('flock_ring', [51_000_003], duration=13.0,
                        outages=(Outage('marker', 6.0, 5.0),))
@@ -104,7 +104,7 @@ def test_followers_that_start_too_far_apart_gather() -> None:
     assert np.nanmin(flights.nearest) > band[0]
 
 
-def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
+def test_failed_one_hovers_then_is_gone_others_go_on() -> None:
     flights, runs = flown(
         'short', [3], duration=12.0, leader=LeaderMotion('wander', speed=(0.3, 0.3)),
         flock={'formation': 'wedge', 'fails': FollowerFailure(2, 4.0, 4.0)})
@@ -116,7 +116,7 @@ def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
 
 
 @pytest.mark.parametrize('ranges', [False, pytest.param(True, marks=pytest.mark.sweep)])
-def test_without_messages_a_flock_keeps_its_band_while_markers_are_hidden(ranges: bool) -> None:
+def test_flock_without_messages_keeps_band_behind_occlusions(ranges: bool) -> None:
     _, runs = flown('flock_line', [0], duration=10.0, ranges=RangeErrors(rate=20.0),
                     outages=(Outage('marker', 4.0, 5.0),),
                     flock={'words': False, 'ranges': ranges})

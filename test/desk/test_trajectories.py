@@ -28,7 +28,7 @@ def flight():
     return fly(20.0)
 
 
-def test_the_leaders_velocity_and_acceleration_are_the_derivatives_of_its_course():
+def test_leader_velocity_and_acceleration_derive_its_course():
     times = np.arange(4001) * TRACK_STEP
     p, v, a, heading = leader_course(times)
     np.testing.assert_allclose(np.gradient(p, TRACK_STEP, axis=0)[1:-1], v[1:-1], atol=1e-4)

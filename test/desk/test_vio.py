@@ -49,7 +49,7 @@ def pose_error(estimate, true):
                            quaternion_to_rotation_vector(turn)])
 
 
-def test_truth_has_the_twist_in_the_child_frame_and_no_covariance(track):
+def test_truth_has_twist_in_child_frame_and_no_covariance(track):
     true = true_odometry(track, 5.0)
     np.testing.assert_allclose(quaternion_to_matrix(true.quaternion) @ true.linear,
                                track.velocity(5.0), atol=1e-6)
@@ -68,7 +68,7 @@ def test_errors_are_as_large_as_the_covariances_say(track, runs, k):
         assert 4.6 < np.mean([e @ np.linalg.solve(c, e) for e, c in each]) < 7.4
 
 
-def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, runs):
+def test_position_and_yaw_drift_as_root_of_time_tilt_does_not(track, runs):
     errors = np.array([[pose_error(run[k], true_odometry(track, TIMES[k])) for run in runs]
                        for k in (40, 159)])
     early, late = errors.std(axis=1)
@@ -79,7 +79,7 @@ def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, r
 
 @pytest.mark.parametrize(('rate', 'gaps'), [
     (200.0, {1}), (100.0, {1}), (50.0, {2}), (20.0, {5}), (30.0, {3, 4})])
-def test_samples_come_at_the_rate_on_average_but_not_more_often_than_the_steps(rate, gaps):
+def test_samples_come_at_mean_rate_not_above_step_rate(rate, gaps):
     due = Due(rate)
     taken = [k for k in range(1000) if due.at(0.01 * k)]
     assert {*np.diff(taken).tolist()} == gaps and taken[0] == 0

@@ -85,7 +85,7 @@ def two(monkeypatch):
 
 @pytest.mark.parametrize(('personality', 'source'), [
     ('px4', 'HIL_STATE_QUATERNION'), ('arducopter', 'SIM_STATE')])
-def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(personality, source):
+def test_each_autopilot_is_asked_for_the_truth_it_sends(personality, source):
     port, now = free_udp_port(), time.monotonic()
     external = ExternalAutopilot(f'udpin:127.0.0.1:{port}')
     autopilot = EmbeddedAutopilot(personality, now=now)

@@ -70,7 +70,7 @@ def received(*arrived, by_estimate=False):
 
 
 @pytest.mark.parametrize('kind', ['SIM_STATE', 'HIL_STATE_QUATERNION'])
-def test_both_truths_are_enu_from_where_the_vehicle_was_first_heard_of(kind):
+def test_both_truths_are_enu_from_first_report(kind):
     motion = received((0, truth(kind)), (1_000, truth(
         kind, (3.0, 2.0, -1.0), (0.5, 0.25, -0.125), math.radians(30.0), (0.1, 0.2, 0.3))))
     now = motion.at(1_000 * MS)  # 3 m to the north in a second: no flight
@@ -93,7 +93,7 @@ def test_a_place_told_in_steps_of_a_centimeter_moves_evenly_and_does_not_drift()
     np.testing.assert_allclose(steps, 0.006 * np.arange(400), atol=0.015)
 
 
-def test_between_poses_the_motion_is_interpolated_and_beyond_them_it_stands_still():
+def test_motion_is_interpolated_between_poses_and_still_beyond():
     motion = received(*((20 * k, truth('SIM_STATE', (k * JUMP * 0.02, 0.0, 0.0), (JUMP, 0.0, 0.0),
                                        yaw=math.pi - 0.1 + 0.1 * k)) for k in range(3)))
     half = motion.at(30 * MS)
@@ -105,7 +105,7 @@ def test_between_poses_the_motion_is_interpolated_and_beyond_them_it_stands_stil
     assert motion.newest == 40 * MS
 
 
-def test_what_happened_in_a_gap_or_after_the_last_pose_is_not_known():
+def test_events_in_a_gap_or_after_last_pose_are_unknown():
     motion = ExternalMotion()
     assert motion.newest is None and not motion.knows(0)
     with pytest.raises(ValueError, match='no pose'):

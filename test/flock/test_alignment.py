@@ -69,7 +69,7 @@ def test_sightings_of_something_else_are_neither_used_nor_sent() -> None:
     assert np.quantile(errors, 0.999) < 0.5
 
 
-def test_the_yaw_of_those_who_hover_is_not_known_without_attitudes() -> None:
+def test_yaw_of_hovering_ones_is_unknown_without_attitudes() -> None:
     flock = flown(Conditions('side by side', still=True), 12.0)
     assert flock.received == {}
     sender = flock.sharing['follower_1'].senders['follower_2']
@@ -126,7 +126,7 @@ def test_a_clock_that_is_ahead_is_refused_and_one_behind_is_told() -> None:
 
 
 @pytest.mark.slow
-def test_words_go_on_where_sight_is_lost_and_say_how_vague_they_become() -> None:
+def test_words_continue_after_loss_with_their_uncertainty() -> None:
     chi2, spread = [], []
     for seed in range(2):
         flock = flown(Conditions('one sees the other', seed, attitude_std=0.03), 5.0)

@@ -63,7 +63,7 @@ def test_a_vehicle_without_a_proper_name_is_refused(name: str) -> None:
         Sharing(name)
 
 
-def test_own_state_and_sightings_are_sent_once_in_a_frame_of_the_own_name() -> None:
+def test_own_state_and_sightings_are_sent_once_in_own_frame() -> None:
     sharing = listening()
     sharing.take_seen(state('odom', LEADER))
     messages = sharing.messages(EPOCH + 10 * MS)
@@ -180,7 +180,7 @@ def test_why_nothing_is_heard_is_told() -> None:
     assert sharing.neighbors(EPOCH) == []
 
 
-def test_an_aligned_teller_is_heard_and_what_is_heard_is_not_told_on() -> None:
+def test_aligned_sender_is_used_and_not_relayed() -> None:
     flock = MadeUpFlock(Conditions('line', attitude_std=0.03))
     sent: dict[str, set[str]] = {}
 
@@ -253,7 +253,7 @@ def exchanged(order: np.random.Generator | None) -> list[Any]:
     return found
 
 
-def test_the_order_of_messages_received_at_one_time_changes_no_bit() -> None:
+def test_order_of_simultaneous_messages_changes_no_bit() -> None:
     first = exchanged(None)
     assert len({(name, child) for name, child, *_ in first}) > 6
     assert exchanged(np.random.default_rng(1)) == first

@@ -52,7 +52,7 @@ def test_velocities_agree_from_when_on_they_stay_so(disagreement: list[float],
     assert m.time_to_agree() == pytest.approx(np.nan if settled is None else settled, nan_ok=True)
 
 
-def test_vicsek_fits_the_papers_figure_only_if_velocities_are_averaged() -> None:
+def test_vicsek_fits_papers_figure_only_with_averaging() -> None:
     averaged, literal = (simulate(*LEADERLESS_START, PAPER_PARAMS, duration=20.0, model=model)
                          for model in ('vicsek_mean_velocity', 'vicsek'))
     assert averaged.metrics.mean_distance[-1] == pytest.approx(0.900, abs=5e-4)

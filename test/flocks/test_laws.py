@@ -54,7 +54,7 @@ def test_the_complete_graph_is_the_papers_law() -> None:
 @pytest.mark.parametrize(('r2', 'push'), [
     (2.9, 0.3 * np.sqrt(2.0) * np.sqrt(2.9) / 1.9 ** 2),  # whole up to d0 + 0.28 (d1 - d0)
     (8.0, 0.0)])
-def test_agents_without_an_edge_only_separate_and_not_beyond_the_band(r2: float,
+def test_agents_without_edge_only_separate_within_band(r2: float,
                                                                       push: float) -> None:
     v = np.array([[0.0, 0.3], [0.0, -0.3]])
     u = laws.graph_accelerations(two(r2), v, FLIGHT_PARAMS, NONE, ALL[:1])
@@ -100,14 +100,14 @@ def test_random_flocks_stay_apart_and_keep_every_edge(agents: int, dimension: in
 @pytest.mark.parametrize(('r2', 'joined', 'small'), [
     (1.6, True, True), (1.4, True, False), (7.4, True, True), (7.6, True, False),
     (1.6, False, True), (1.4, False, False), (9.0, False, True)])
-def test_a_step_is_small_up_to_half_the_way_to_an_edge_of_the_band(r2: float, joined: bool,
+def test_step_is_small_up_to_half_way_to_band_edge(r2: float, joined: bool,
                                                                    small: bool) -> None:
     before = two(2.0 if r2 < 4.0 else 7.0)  # gaps of 1 m^2
     assert laws.step_is_small(before, two(r2), FLIGHT_PARAMS, ALL[:1] if joined else NONE,
                               ALL[:1]) is small
 
 
-def test_one_agent_that_knows_all_commands_itself_the_law_of_the_flock() -> None:
+def test_agent_that_knows_all_commands_itself_the_flock_law() -> None:
     rng, params = np.random.default_rng(0), flocking.FlockingParams(beta=0.25, d1=8.0)
     places = np.array([[1.9 * (k % 3), 1.9 * (k // 3), 0.0] for k in range(7)])
     x, v = places + rng.uniform(-0.2, 0.2, (7, 3)), rng.normal(0.0, 0.3, (7, 3))
@@ -122,7 +122,7 @@ def test_one_agent_that_knows_all_commands_itself_the_law_of_the_flock() -> None
         assert own == pytest.approx(whole[k], rel=1e-9)
 
 
-def test_an_edge_longer_than_the_band_pulls_no_harder_than_it_may() -> None:
+def test_edge_longer_than_band_pulls_within_its_limit() -> None:
     params = flocking.FlockingParams(beta=0.25, d1=8.0)
     offsets, differences = np.array([[6.0, 0.0, 0.0]]), np.array([[0.0, 0.2, 0.0]])
     nobody = np.zeros(1, dtype=bool)
@@ -132,7 +132,7 @@ def test_an_edge_longer_than_the_band_pulls_no_harder_than_it_may() -> None:
     assert pushed[0] < -1e3  # separation is not bounded here
 
 
-def test_a_vehicle_that_is_no_part_of_the_flock_changes_nothing_out_of_the_band() -> None:
+def test_vehicle_outside_flock_changes_nothing_outside_band() -> None:
     params = flocking.FlockingParams(beta=0.25, d1=8.0)
     offsets = np.array([[2.2, 0.0, 0.0], [0.0, 3.0, 0.0]])
     differences = np.array([[0.0, 0.1, 0.0], [9.0, 0.0, 0.0]])

@@ -36,7 +36,7 @@ WIND = np.array([7.5, 0.0, 0.0])
 """m/s; the embedded vehicle's drag, 0.1 1/s, makes 0.75 m/s^2 of it."""
 
 
-def test_without_a_velocity_the_estimate_stays_and_without_our_setpoints_it_is_forgotten():
+def test_estimate_stays_without_velocity_ends_without_setpoints():
     observer = DisturbanceObserver()
     for k in range(120):
         observer.step(np.zeros(3), np.array([0.05 * k, 0.0, 0.0]) if k < 100 else None, k * STEP)

@@ -163,7 +163,7 @@ def test_the_bounds_are_those_of_the_approach_speeds():
     assert bound == pytest.approx((0.5 - approach_speed(10.0, braking)) / 0.5)
 
 
-def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
+def test_gate_on_ground_sends_nothing_upward_in_any_noise():
     limits = GateLimits()
     rng, gate = np.random.default_rng(5), Gate(limits, 'odom')
     gate.permit(Permission().request(-1.0))
@@ -198,5 +198,5 @@ def test_the_flight_defaults():
 @pytest.mark.parametrize(('limits', 'tolerance'), [
     (GateLimits(), 0.4), (GateLimits(v_max=2.0), 1.0),
     (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7)])
-def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):
+def test_allowed_velocity_difference_follows_v_max_unless_set(limits, tolerance):
     assert limits.velocity_tolerance == tolerance

@@ -55,7 +55,7 @@ def reason(end=None, active_since=10.0, command_time=NEVER, handover='', now=20.
     ({}, {'command_time': 20.0, 'now': 20.01 + COMMAND_TIMEOUT}, 'no command for 3 s'),
     ({}, {'active_since': math.inf, 'now': 999.0}, '')])
 @pytest.mark.parametrize('action', [HOLD, LAND])
-def test_before_the_first_command_the_engage_timeout_counts_and_after_it_three_seconds(
+def test_engage_timeout_before_first_command_then_3_s(
         options, at, why, action):
     end = FlightEnd(EndParams(leader_lost_action=action, **options))
     assert reason(end, **at) [:2] == (why, action if why else HOLD)
@@ -110,7 +110,7 @@ def test_a_landing_follows_only_in_the_mode_that_was_requested():
 
 @pytest.mark.parametrize('status', [
     HELD._replace(mode='POSCTL'), OURS, HELD._replace(armed=False)])
-def test_any_other_mode_once_or_a_new_request_cancels_the_landing(status):
+def test_other_mode_once_or_new_request_cancels_landing(status):
     later, asked = handed_over(), handed_over()
     assert step(later, 2.5, False, held='AUTO.LOITER', status=status) == ''
     asked.begin()
@@ -123,7 +123,7 @@ def test_any_other_mode_once_or_a_new_request_cancels_the_landing(status):
 
 @pytest.mark.slow
 @BOTH
-def test_a_planner_that_dies_is_followed_by_hold_mode_within_four_seconds(personality):
+def test_dead_planner_leads_to_hold_mode_within_4_s(personality):
     flight = Flight(personality, bridge={'report_to_gcs': True}).follow(2.0)
     flight.planner, killed = None, flight.vehicle.position[2]
     took = flight.fly_until(lambda: flight.mode != flight.modes.offboard, 6.0)
@@ -136,7 +136,7 @@ def test_a_planner_that_dies_is_followed_by_hold_mode_within_four_seconds(person
 
 
 @pytest.mark.slow
-def test_no_mode_is_requested_while_the_autopilot_is_not_received():
+def test_no_mode_is_requested_while_autopilot_is_silent():
     # The pilot may have switched: a request for hold would take the vehicle back.
     flight = Flight(faults=[Fault('drop', 5.0, 6.0, 'sent')]).follow(2.5)
     flight.planner = None
@@ -148,7 +148,7 @@ def test_no_mode_is_requested_while_the_autopilot_is_not_received():
 
 
 @pytest.mark.slow
-def test_a_hold_that_the_bridge_requested_is_not_repeated_while_nothing_is_received():
+def test_requested_hold_is_not_repeated_without_telemetry():
     flight = Flight(faults=[Fault('drop', 6.8, 5.0, 'sent'), Fault(
         'drop', 6.8, 1.3, 'received', message='COMMAND_LONG')]).follow(1.0)
     flight.planner = None
@@ -193,7 +193,7 @@ JITTER = st.lists(st.floats(0.0, 0.08), min_size=16, max_size=24)
 
 
 @given(first=FIRST, late=JITTER, lost=st.sets(st.integers(0, 40), max_size=20))
-def test_one_publisher_is_one_however_many_of_its_commands_are_lost(first, late, lost):
+def test_one_publisher_counts_as_one_whatever_is_lost(first, late, lost):
     assert not noticed(publisher(first, 0.0, late, lost))
 
 
@@ -213,6 +213,6 @@ def test_a_single_command_of_a_second_node_is_noticed(number, own, late, at):
     assert found and at <= found[0] < at + 2 * PERIOD
 
 
-def test_where_the_middleware_does_not_number_messages_nothing_is_noticed():
+def test_middleware_without_numbers_reports_no_loss():
     sources = CommandSources()
     assert not any(sources.another(None, 0.01 * k) for k in range(10))

@@ -74,7 +74,7 @@ def test_a_fresh_command_passes_unchanged():
 
 
 @pytest.mark.parametrize(('age', 'until'), [(0.0, 10.2), (0.15, 10.05), (0.2, 10.0)])
-def test_a_command_older_than_the_planner_timeout_by_its_stamp_is_replaced_by_braking(age, until):
+def test_command_older_than_planner_timeout_is_replaced_by_brake(age, until):
     gate = fresh_gate()
     assert gate.take_command(Command(FORWARD, 1.0), age, 10.0) == ''
     gate.take_motion('odom', MotionReport([0.4, 0, 0]), 0.0, until)
@@ -96,7 +96,7 @@ def lost_odometry(command_time, now, autopilot=(-0.4, 0.0, 0.0), retreat=(-1.0, 
     return decide(gate, now)
 
 
-def test_without_odometry_it_goes_on_backing_away_from_a_neighbor_that_came():
+def test_retreat_goes_on_without_odometry():
     for now in (10.31, 12.99):
         decision = lost_odometry(10.25, now)
         assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
@@ -116,7 +116,7 @@ def test_the_retreat_without_odometry_ends(command_time, now, autopilot, retreat
 
 @pytest.mark.parametrize(('age', 'reason'), [
     (0.21, 'too old'), (3600.0, 'too old'), (-0.2, 'from the future'), (math.nan, 'not finite')])
-def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):
+def test_commands_with_impossible_stamps_are_refused(age, reason):
     gate = flying_gate()
     assert gate.take_command(Command(FORWARD, 0.0), age, 10.0) == reason
     decision = decide(gate, 10.0)  # without any velocity, and without a yaw
@@ -132,7 +132,7 @@ def test_a_command_that_rests_on_an_old_image_is_refused(source_age, reason):
 
 @pytest.mark.parametrize(('speed', 'reason'), [
     (100.1, 'too fast'), (1e300, 'too fast'), (math.inf, 'not finite'), (math.nan, 'not finite')])
-def test_an_implausible_velocity_is_refused_and_the_last_one_counts(speed, reason):
+def test_implausible_velocity_is_refused_last_one_counts(speed, reason):
     gate = fresh_gate()
     gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
     assert gate.take_motion('odom', MotionReport([0.0, 0.0, -speed]), 0.0, 10.1) == reason
@@ -148,7 +148,7 @@ def test_late_odometry_brakes_more_softly_from_its_stamp_on():
     np.testing.assert_allclose(decision.acceleration, [-0.4 / (0.3 + 0.2 * math.e), 0, 0])
 
 
-def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one():
+def test_only_accepted_command_asks_for_one_decision_at_once():
     gate = flying_gate()
     assert gate.take_command(Command(FORWARD, 0.0), 0.3, 10.0) == 'too old'
     assert not gate.commands.is_new
@@ -162,7 +162,7 @@ def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one
 
 
 @pytest.mark.parametrize(('flown', 'yaws'), [(True, (0.7, 0.7)), (False, (0.7, 0.9))])
-def test_the_yaw_is_held_from_the_moment_braking_begins_once_it_is_obeyed(flown, yaws):
+def test_yaw_is_held_from_braking_once_obeyed(flown, yaws):
     gate = fresh_gate() if flown else fly(Gate(), 10.0, NOT_FLOWN)
     for now, yaw, expected in zip((10.25, 10.3), (0.7, 0.9), yaws):
         gate.motion.take_yaw('autopilot', yaw, now)
@@ -192,7 +192,7 @@ def test_a_height_that_ceases_hands_the_vehicle_over():
     (0, False, '', 'autopilot'), (2, True, '', 'barometer'),
     # An estimate that rests on the odometry, or on nothing, proves nothing.
     (0, True, '', ''), (0, False, 'rests on GPS, whose fix is lost', '')])
-def test_displacements_that_differ_brake_and_hand_the_vehicle_over(
+def test_displacement_mismatch_brakes_and_hands_over(
         axis, fused, distrusted, other):
     gate = fresh_gate()
     gate.autopilot = gate.autopilot._replace(fused=fused)
@@ -207,7 +207,7 @@ def test_displacements_that_differ_brake_and_hand_the_vehicle_over(
     assert other in decision.reason and other in gate.handover(now)
 
 
-def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_forgotten():
+def test_command_is_accepted_only_while_active():
     gate = Gate(LIMITS)
     assert gate.take_motion('odom', MotionReport((0.1, 0.0, 0.0)), 0.0, 10.0) == ''
     gate.take_status(FLOWN, 10.0)

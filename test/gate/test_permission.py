@@ -67,11 +67,11 @@ def after(*events):
     (), (seen(HOLD),), (seen(OURS),), (seen(HOLD), seen(OURS), seen(OURS)),
     (LANDED, seen(OURS)), (ENDED, seen(OURS)),
     (REBOOTED, seen(OURS)), (('fail', 'late'), seen(OURS))])
-def test_nothing_may_be_sent_before_offboard_was_requested_whatever_the_mode(events):
+def test_nothing_is_sent_before_offboard_in_any_mode(events):
     assert not after(*events).streams
 
 
-def test_a_request_streams_and_the_mode_in_the_air_makes_it_active():
+def test_request_streams_and_mode_in_the_air_makes_it_active():
     assert (after(ASKED).phase, after(ASKED).reason) == (
         Phase.READY, 'waiting for offboard mode')
     waiting = after(ASKED, seen(HOLD), seen(OURS, airborne=None))
@@ -113,7 +113,7 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
     ((ASKED, seen(OURS), ENDED), True), ((ASKED, seen(OURS), seen(DISARMED)), False),
     ((ASKED, seen(OURS), seen(PILOT)), False), ((ASKED, seen(OURS), REBOOTED), False),
     ((ASKED, seen(OURS), seen(PILOT), ('request', 3.0)), False)])
-def test_it_flies_from_when_the_mode_is_seen_until_it_streams_no_more(events, flies):
+def test_it_flies_from_mode_report_until_stream_ends(events, flies):
     assert after(*events).flies is flies
 
 
@@ -122,7 +122,7 @@ def test_a_heartbeat_from_before_the_request_has_no_effect(received):
     assert after(ASKED, seen(OURS, received)) == after(ASKED, seen(HOLD, received)) == after(ASKED)
 
 
-def test_a_refused_request_ends_and_without_a_velocity_the_stream_falls_silent():
+def test_refused_request_ends_and_stream_without_velocity_stops():
     assert after(ASKED, ('fail', 'refused')).announcement() == 'INACTIVE: refused'
     silent = after(ASKED, seen(OURS), ('fall_silent', 'no velocity'))
     assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
@@ -131,7 +131,7 @@ def test_a_refused_request_ends_and_without_a_velocity_the_stream_falls_silent()
         assert next_permission(idle, ('fall_silent', 'no velocity')) is idle
 
 
-def test_a_late_refusal_ends_nothing_that_the_vehicle_obeys_already():
+def test_late_refusal_ends_nothing_that_vehicle_already_obeys():
     for obeying in (after(ASKED, seen(OURS)), after(ASKED, seen(OURS, airborne=None))):
         assert next_permission(obeying, ('fail', 'late')) is obeying
         assert next_permission(obeying, ENDED).phase is Phase.GIVING_BACK
@@ -143,7 +143,7 @@ def test_active_it_stays_from_heartbeat_to_heartbeat(airborne):
     assert next_permission(active, seen(OURS, 3.0, airborne)) == replace(active, received=3.0)
 
 
-def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
+def test_giving_back_brakes_until_mode_is_left_then_stops():
     giving = after(ASKED, seen(OURS), ENDED, seen(OURS))
     assert giving.announcement() == 'READY: giving back: hold requested'
     assert giving.streams and giving.flies
@@ -164,7 +164,7 @@ def test_where_two_nodes_command_it_brakes_until_asked_again():
     assert next_permission(again, seen(OURS, 4.5)).phase is Phase.ACTIVE
 
 
-def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
+def test_long_silence_may_hide_a_takeover_and_return():
     active = after(ASKED, seen(OURS, 2.0), seen(OURS, 2.0 + LONGEST_SILENCE))
     assert active.phase is Phase.ACTIVE
     lost = next_permission(active, seen(OURS, active.received + LONGEST_SILENCE + 0.1))
@@ -212,7 +212,7 @@ def test_the_picture_shows_every_step_and_no_other():
 
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=30))
-def test_nothing_but_a_request_lets_the_stream_begin_and_only_active_obeys_commands(events):
+def test_only_a_request_begins_stream_only_active_flies_commands(events):
     permission = Permission()
     for event in events:
         before, permission = permission, next_permission(permission, event)

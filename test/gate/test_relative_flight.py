@@ -67,7 +67,7 @@ def test_a_command_on_the_marker_alone_passes_as_it_is():
     ({'command_age': 0.21}, 'command stale'), ({'command_age': math.nan}, 'command stale'),
     ({'command': FORWARD._replace(acceleration=(0.1, math.nan, 0.0))}, 'command not finite'),
     ({'command': FORWARD._replace(yaw=math.inf)}, 'command not finite')])
-def test_each_obstacle_ends_it_as_the_loss_of_odometry_does_today(change, reason):
+def test_each_obstacle_ends_it_as_lost_odometry_does(change, reason):
     setpoint = judge(**change)
     assert (setpoint.kind, setpoint.reason) == (NONE, reason)
 
@@ -90,7 +90,7 @@ COMPONENT = ANY | st.floats(-3.0, 3.0) | st.floats(-1e300, 1e300)
 @example((0.0, 0.0, -1.0), 0.0, 0.9, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 @example((0.0, 0.0, 1.0), 0.0, 9.6, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 @example((1.5, 0.0, 0.0), 0.0, 5.0, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
-def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
+def test_acceleration_is_small_and_leads_into_heights(
         wanted, yaw, height, climb, lasted, marker_age, offset, a_max, airborne):
     limits = GateLimits(relative_flight=True, a_max=a_max)
     setpoint = judge(limits, command=Command(wanted, yaw, relative=True),
@@ -148,7 +148,7 @@ class Flown:
         return [self.cycle(*args, **options) for _ in range(round(seconds / 0.05))][-1]
 
 
-def test_it_begins_once_odometry_that_was_flown_on_is_lost_and_ends_when_it_returns():
+def test_it_begins_when_used_odometry_is_lost_ends_on_return():
     vehicle = Flown()
     vehicle.permit()
     vehicle.for_seconds(1.0, False)
@@ -181,7 +181,7 @@ def test_by_default_it_never_begins_and_the_loss_ends_as_before(limits):
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(['odometry', 'none', 'takeover', 'offboard', 'silent']),
                           st.floats(0.1, 15.0)), max_size=10))
-def test_never_longer_than_the_timeout_and_never_after_a_takeover(events):
+def test_it_ends_at_timeout_and_never_follows_a_takeover(events):
     vehicle = Flown(GateLimits(relative_flight=True, relative_timeout=8.0, blind_timeout=10.0))
     vehicle.permit()
     vehicle.for_seconds(1.0, False)
@@ -206,7 +206,7 @@ def test_never_longer_than_the_timeout_and_never_after_a_takeover(events):
         assert len(span) == 0 or span[-1] - span[0] <= 8.0 + 1.1
 
 
-def test_time_without_odometry_is_made_up_for_by_as_much_time_with_it():
+def test_time_without_odometry_is_balanced_by_time_with_it():
     vehicle = Flown(GateLimits(relative_flight=True, relative_timeout=8.0, blind_timeout=10.0))
     vehicle.permit()
     vehicle.for_seconds(1.0, False)
@@ -218,7 +218,7 @@ def test_time_without_odometry_is_made_up_for_by_as_much_time_with_it():
         vehicle.cycle(False)
 
 
-def test_displacements_that_differ_are_flown_without_odometry_and_then_handed_over():
+def test_displacement_mismatch_flies_without_odometry_then_ends():
     vehicle = Flown()
     vehicle.permit()
     for k in range(800):

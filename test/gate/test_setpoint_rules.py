@@ -102,7 +102,7 @@ TOO_LOW_AND_FAR = Location(0.3, 0.0, np.array([50.5, 0.0]))
 
 @pytest.mark.parametrize('command', [FORWARD, None])
 @pytest.mark.parametrize('speed', [0.1, 99.0, 100.1, 1e200])
-def test_no_velocity_however_wrong_removes_a_bound_of_the_envelope(command, speed):
+def test_no_wrong_velocity_removes_a_bound_of_envelope(command, speed):
     odom = SLOW._replace(velocity=(0.0, speed, 0.0))
     setpoint = judge(command=command, odom=odom, place=TOO_LOW_AND_FAR)
     assert setpoint.kind == (BRAKE if command is None or speed > 100.0 else COMMAND)
@@ -159,7 +159,7 @@ def test_yaws_may_differ_by_the_limit_and_not_by_more_either_way():
 @pytest.mark.parametrize(('disagreeing_for', 'kind'), [
     (-0.01, COMMAND), (0.0, LEVEL), (0.6, LEVEL), (0.601, NONE), (math.inf, NONE),
     (math.nan, COMMAND)])
-def test_velocities_that_began_to_disagree_level_it_and_then_end_the_stream(
+def test_velocity_mismatch_levels_then_ends_stream(
         disagreeing_for, kind):
     setpoint = judge(disagreeing_for=disagreeing_for)
     assert setpoint.kind == kind
@@ -192,7 +192,7 @@ def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
 
 
 @pytest.mark.parametrize('delay', [0.05, 0.15, 0.29])
-def test_a_height_that_is_held_does_not_swing_however_late_the_velocity(delay):
+def test_held_height_does_not_oscillate_with_late_velocity(delay):
     step, response = 0.01, 0.25  # s: thrust follows late, too
     heights, rates, acceleration, commanded = [2.4] * 50, [0.0] * 50, 0.0, 0.0
     for k in range(3000):
@@ -313,7 +313,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments)
 @given(st.floats(1.5, 20.0), st.floats(V_MAX.low, 2.0), DIRECTION, st.floats(0.0, 3.0),
        st.tuples(*[st.floats(-20.0, 20.0)] * 3), st.tuples(*[st.floats(-2.0, 2.0)] * 3),
        st.none() | st.floats(-math.pi, math.pi), st.sampled_from([True, False]))
-def test_the_offset_is_added_to_the_command_except_along_too_fast_a_velocity(
+def test_offset_is_added_except_along_too_fast_velocity(
         a_max, v_max, direction, speed, wanted, offset, axis, commanded):
     limits = GateLimits(a_max=a_max, v_max=v_max)
     v = speed * v_max * np.array(direction) / np.linalg.norm(direction)

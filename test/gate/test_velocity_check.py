@@ -62,7 +62,7 @@ def test_what_is_not_three_finite_numbers_is_no_vector(value):
 
 @pytest.mark.parametrize(('yaw', 'own', 'turned'), [
     (3.1, -3.1, 6.2 - 2 * math.pi), (0.5, 0.4, 0.1), (0.0, 0.4, -0.4), (0.0, -0.4, 0.4)])
-def test_the_difference_of_yaws_is_wrapped_and_signed_and_has_a_limit(yaw, own, turned):
+def test_yaw_difference_is_wrapped_signed_and_limited(yaw, own, turned):
     known = by(ODOM, odom=SLOW._replace(yaw=yaw), autopilot=ACROSS._replace(yaw=own))
     assert known.turned == pytest.approx(turned)
     assert known.contradiction == (Obstacle.YAWS_DISAGREE if abs(turned) == 0.4 else None)
@@ -73,7 +73,7 @@ def test_the_difference_of_yaws_is_wrapped_and_signed_and_has_a_limit(yaw, own, 
 
 @pytest.mark.parametrize('unusable', [
     {'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw': math.nan}])
-def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
+def test_only_two_fresh_finite_yaws_can_disagree(unusable):
     turned = SLOW._replace(yaw=2.5)
     for known in (by(ODOM, odom=turned, autopilot=SLOW._replace(**unusable)),
                   by(ODOM, odom=turned._replace(**unusable), autopilot=SLOW)):
@@ -88,7 +88,7 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     *((by(source, odom=SLOW._replace(yaw=2.0), disagreeing_for=since), ACROSS)
       for source in (ODOM, AUTOPILOT) for since in (-math.inf, 1.0)),
     (by(AUTOPILOT, odom=SLOW._replace(yaw=2.0), autopilot=ACROSS._replace(**LATE)), SLOW)])
-def test_braking_takes_the_velocity_of_the_source_first_then_the_other(known, velocity):
+def test_braking_takes_source_velocity_first_then_the_other(known, velocity):
     assert tuple(known.braking.vector) == velocity.velocity
 
 
@@ -113,7 +113,7 @@ def test_it_is_blind_once_the_last_velocity_is_long_gone(ages, is_blind):
 @pytest.mark.parametrize('why', ['disagreeing_for', 'distrusted_for'])
 @pytest.mark.parametrize(('seconds', 'is_blind'), [
     (-0.01, False), (0.6, False), (0.601, True), (math.inf, True), (math.nan, False)])
-def test_it_is_blind_sooner_where_a_velocity_is_told_that_cannot_be_believed(
+def test_it_is_blind_sooner_with_an_untrusted_velocity(
         why, seconds, is_blind):
     assert blind(0.4, 0.4, **{why: seconds}) == is_blind
     # Good odometry is all that is needed, unless one of both is wrong.
@@ -138,14 +138,14 @@ NOISE = np.random.default_rng(1).normal(0.0, 0.2, 2000).tolist()
 @pytest.mark.parametrize(('differences', 'disagree'), [
     *(([0.0] * 10 + [wrong], False) for wrong in (3.0, 1e9, 1.7e308)),  # one wrong sample
     ([0.7] * 4, True), ([0.3] * 12, True), ([50.0] * 4, True), (NOISE, False)])
-def test_velocities_disagree_by_their_average_and_the_sooner_the_more(differences, disagree):
+def test_velocities_disagree_by_mean_sooner_if_more(differences, disagree):
     for rate in (20.0, 50.0) if not disagree else (20.0,):
         comparison, now = compared(differences, rate)
         assert (comparison.disagreeing_for(now) >= 0.0) == disagree
 
 
 @pytest.mark.parametrize(('samples', 'latched'), [(20, True), (4, False)])
-def test_what_disagreed_for_long_does_so_until_it_no_longer_flies(samples, latched):
+def test_long_mismatch_lasts_until_it_no_longer_flies(samples, latched):
     comparison, now = compared([0.7] * samples)
     assert (comparison.disagreeing_for(now) > LATCH_TIME) == latched
     for _ in range(100):
@@ -175,7 +175,7 @@ def still(t):
 
 
 @pytest.mark.parametrize('turn', [0.0, 1.0, -2.5])
-def test_equal_motions_differ_by_nothing_in_frames_that_are_turned(turn):
+def test_equal_motions_in_turned_frames_do_not_differ(turn):
     first, second = paths(8.0, lambda t: (0.4 * t, 0.1 * t, 0.2 * t),
                           lambda t: (5.0 + 0.4 * t, 0.1 * t - 3.0, 0.2 * t), turn)
     assert np.linalg.norm(difference(first, second, turn, 8.0)) < 1e-9
@@ -208,7 +208,7 @@ def test_what_is_old_or_interrupted_is_not_compared():
     (1, 0.6, 0.25, False, False), (2, 0.6, 0.0, False, False),
     (2, 1.0, 0.0, True, True), (2, -1.0, 0.0, True, True), (2, 0.8, 0.0, True, False),
     (2, 1.0, 0.4, True, False), (1, 2.0, 0.0, True, False)])
-def test_displacements_that_differ_beyond_their_deviations_are_reported(
+def test_displacement_mismatch_beyond_deviation_is_reported(
         axis, drift, std, height, contradicts):
     odom, autopilot = Source(), Source()
     odom.path, autopilot.path = paths(4.0, lambda t: drift * t / 4.0 * np.eye(3)[axis], still)
@@ -219,7 +219,7 @@ def test_displacements_that_differ_beyond_their_deviations_are_reported(
     assert not why or ('barometer' in why.detail) == height
 
 
-def test_the_yaw_nearest_to_a_time_is_returned_and_old_ones_are_forgotten():
+def test_yaw_nearest_to_time_is_returned_old_ones_forgotten():
     source = Source()
     assert source.yaw(1.0) == source.yaw() == (0.0, -math.inf)
     for step in range(31):

@@ -71,7 +71,7 @@ def test_setpoints_it_cannot_fly_stop_it_without_a_word(refused):
 
 
 @pytest.mark.parametrize(('parameters', 'timeout'), [({}, 3.0), ({'GUID_TIMEOUT': 0.5}, 0.5)])
-def test_it_keeps_accelerating_for_guid_timeout_then_stops_and_stays_in_guided(
+def test_it_accelerates_for_guid_timeout_then_stops_in_guided(
         parameters, timeout):
     flight = guided(parameters=parameters)
     flight.fly(1.0, setpoint(1.0))

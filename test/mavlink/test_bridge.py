@@ -20,7 +20,7 @@ import pytest
 pytestmark = pytest.mark.slow
 
 
-def test_offboard_is_taken_over_from_hold_and_commands_are_flown_in_a_steady_stream():
+def test_offboard_begins_from_hold_and_flies_steady_stream():
     flight = Flight()
     flight.fly(2.1)
     asked = flight.now
@@ -59,7 +59,7 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
 
 
 @BOTH
-def test_a_pilot_who_has_taken_over_is_left_alone_at_the_end_of_the_bridge(personality):
+def test_pilot_in_control_is_left_alone_at_end_of_bridge(personality):
     flight = Flight(personality).follow(1.0)
     flight.controller.pilot_switches(flight.modes.manual)
     flight.fly(1.2)  # HEARTBEAT comes at 1 Hz
@@ -70,7 +70,7 @@ def test_a_pilot_who_has_taken_over_is_left_alone_at_the_end_of_the_bridge(perso
 
 
 @BOTH
-def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
+def test_end_of_bridge_does_not_end_unreported_landing(personality):
     flight = Flight(personality)
     flight.engage()
     flight.bridge.requests.land(flight.now)

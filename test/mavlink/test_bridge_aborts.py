@@ -42,7 +42,7 @@ def in_offboard_before_a_heartbeat_says_so(personality):
 
 
 @BOTH
-def test_an_abort_right_after_offboard_holds_though_heartbeat_shows_hold_still(personality):
+def test_abort_after_offboard_holds_though_heartbeat_shows_hold(personality):
     flight, _ = in_offboard_before_a_heartbeat_says_so(personality)
     assert flight.ask('offboard', False).success
     flight.fly(2.0)
@@ -50,7 +50,7 @@ def test_an_abort_right_after_offboard_holds_though_heartbeat_shows_hold_still(p
 
 
 @BOTH
-def test_a_pilot_who_takes_back_what_no_heartbeat_has_shown_is_not_overruled(personality):
+def test_pilot_takeover_without_heartbeat_is_not_overruled(personality):
     flight, request = in_offboard_before_a_heartbeat_says_so(personality)
     flight.controller.pilot_switches(flight.modes.loiter)  # the mode it was in before
     flight.fly(5.0)
@@ -77,7 +77,7 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
     assert not flight.commands(SET_MODE, switched)  # nor is anything asked of the vehicle
 
 
-def test_a_switch_away_and_back_in_messages_that_arrive_together_is_seen():
+def test_switch_away_and_back_arriving_together_is_seen():
     flight = Flight().follow(1.0)
     codec = mavlink.MAVLink(None, 1, 1)
     flight.wire.arrived += [
@@ -88,7 +88,7 @@ def test_a_switch_away_and_back_in_messages_that_arrive_together_is_seen():
         'TAKEN_OVER: offboard was left for POSCTL: the pilot took over')
 
 
-def test_a_line_that_delivers_late_gets_no_setpoint_while_nothing_is_received():
+def test_late_line_gets_no_setpoint_while_nothing_is_received():
     wire = MemoryLine()
     wire.delivers_late = True
     flight = Flight(wire=wire, faults=[Fault('drop', 4.0, 4.0, 'sent')]).follow(4.5)
@@ -120,7 +120,7 @@ def mode_lost(at, personality='px4', duration=30.0):
 
 
 @BOTH
-def test_telemetry_without_the_mode_brakes_after_3_s_and_ends_the_permission(personality):
+def test_missing_mode_brakes_after_3_s_and_ends_permission(personality):
     flight = Flight(personality, faults=mode_lost(4.0)).follow(1.0)
     flight.fly_until(lambda: flight.bridge.telemetry.mode_age(flight.now) > 2.9, 10.0)
     assert flight.kinds(5) == {'command'} and flight.mode == flight.modes.offboard
@@ -179,7 +179,7 @@ def test_a_short_loss_forgets_no_answer_of_the_autopilot():
 # Another flight, another vehicle.
 
 
-def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():
+def test_rebooted_autopilot_is_asked_again_except_offboard():
     flight = Flight().follow(1.0)
     asked = sum(m.get_type() == 'PARAM_REQUEST_READ' for _, m in flight.received)
     flight.autopilot.reboot(flight.now, 1.0)
@@ -193,7 +193,7 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():
 
 @pytest.mark.parametrize(('what', 'why'), [
     ('reboots', 'the autopilot rebooted'), ('peer_changes', 'another vehicle took the place')])
-def test_after_a_reboot_or_with_another_vehicle_nothing_is_sent_before_a_new_request(what, why):
+def test_reboot_or_other_vehicle_needs_new_request_to_send(what, why):
     flight = Flight('arducopter').follow(1.0)
     owner = flight.bridge.telemetry if what == 'reboots' else flight.bridge.link
     checked = flight.bridge.housekeeping.parameters

@@ -33,7 +33,7 @@ def forwarding(flight):
 
 
 @BOTH
-def test_two_whole_flights_from_arming_to_landing_need_nothing_but_the_services(personality):
+def test_two_whole_flights_need_only_the_services(personality):
     flight = Flight(personality, start='landed', ready_after=1.0)
     flight.fly(2.5)
     for _ in range(2):
@@ -57,7 +57,7 @@ def test_two_whole_flights_from_arming_to_landing_need_nothing_but_the_services(
 # Without GPS.
 
 
-def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer():
+def test_forwarded_climb_is_corrected_by_barometer():
     """The autopilot's height follows it, in the hold mode too: on real ones to the ground."""
     flight = forwarding(Flight(**without_gps('px4')))
     flight.engage()
@@ -73,7 +73,7 @@ def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer()
 
 @pytest.mark.parametrize(('personality', 'action'), [
     ('px4', 'silence'), ('px4', 'land'), ('arducopter', 'land')])
-def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(personality, action):
+def test_lost_odometry_behind_autopilot_estimate_ends_stream(personality, action):
     flight = forwarding(Flight(personality, **without_gps(personality, blind_action=action)))
     flight.follow(2.0)
     lost, flight.forwards, flight.odometry = flight.now, False, False
@@ -92,7 +92,7 @@ def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(per
     assert action == 'land' or not flight.commands(mavlink.MAV_CMD_DO_SET_MODE, lost)
 
 
-def test_on_a_congested_line_setpoints_are_sent_and_odometry_is_not():
+def test_congested_line_sends_setpoints_and_no_odometry():
     flight = forwarding(Flight(**without_gps('px4')))
     flight.engage()
     flight.wire.is_congested, start = lambda: True, flight.now

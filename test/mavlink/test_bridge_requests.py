@@ -83,7 +83,7 @@ def test_what_was_waived_is_not_refused():
      'MIS_TAKEOFF_ALT = 10.0 m: it would climb that high'),
     ({'start': 'armed', **never('PARAM_VALUE')}, 7.0, 1.0, 'MIS_TAKEOFF_ALT = unknown m'),
     ({'start': 'armed'}, 3.0, 20.0, 'above height_max = 10 m')])
-def test_a_take_off_that_cannot_be_is_refused_before_it_is_asked_for(
+def test_impossible_take_off_is_refused_before_request(
         options, waits, height, reason):
     flight = Flight(**options)
     flight.fly(waits)
@@ -154,7 +154,7 @@ def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming():
     assert bridge.unready(flight.now) == 'the safety button'
 
 
-def test_arming_after_a_take_off_that_was_ended_by_a_landing_does_not_climb():
+def test_arming_after_take_off_ended_by_landing_does_not_climb():
     """PX4 is in AUTO.TAKEOFF again, and takes off as soon as it is armed."""
     flight = Flight(start='landed')
     flight.fly(2.0)

@@ -62,7 +62,7 @@ UNPLACED = ['no valid position estimate', 'no global position (neither GPS nor a
     ('px4_1.18_refusals', 26.0, 'AUTO.LAND', ['it does not arm in this mode']),
     ('px4_1.18_refusals', 44.0, 'OFFBOARD', []),
     ('px4_1.18_refusals', 50.0, 'OFFBOARD', ['no setpoint stream'])])
-def test_px4_reports_what_it_would_refuse_without_a_ground_station(name, time, mode, reasons):
+def test_px4_reports_refusals_without_ground_station(name, time, mode, reasons):
     assert received(name, time).texts.against(mode) == reasons
 
 
@@ -100,7 +100,7 @@ def lost(personality, seconds):
 @pytest.mark.parametrize(('personality', 'name', 'kind', 'end', 'seconds'), [
     ('px4', 'px4_vision_lost', 'ESTIMATOR_STATUS', 63.63, 7.0),
     ('arducopter', 'ardupilot_vision_lost', 'EKF_STATUS_REPORT', 41.06, 16.0)])
-def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
+def test_embedded_estimator_gives_up_when_real_one_does(
         personality, name, kind, end, seconds):
     real = flags(name, kind, end)
     flight, states, known = lost(personality, 0.01), [], None

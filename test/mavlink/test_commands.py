@@ -155,7 +155,7 @@ def test_no_mode_is_requested_against_what_was_not_received(goal, script, modes,
     assert not request.outcome.success and request.outcome.message.endswith(reason)
 
 
-def test_what_was_shown_before_the_command_was_sent_does_not_count():
+def test_reports_before_the_command_do_not_count():
     request = Request(PX4, commands.land(PX4), 0.0)
     for now, shown, sent in ((0.0, -0.1, 0), (0.3, -0.1, None), (0.6, 0.5, None)):
         assert request.outcome is None
@@ -175,7 +175,7 @@ def test_acks_of_other_commands_are_not_taken():
 
 @pytest.mark.parametrize(('dialect', 'modes'), [
     (PX4, ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ARDUPILOT, ('BRAKE', 'LAND'))])
-def test_where_hold_is_refused_the_next_mode_is_asked_for_and_told(dialect, modes):
+def test_refused_hold_is_followed_by_next_mode_and_reported(dialect, modes):
     flying = shows(dialect.offboard)
     script = every(flying, 0.6 * (len(modes) - 1), REJECTED)
     now = script[-1][0] + 0.2
@@ -193,7 +193,7 @@ def test_where_hold_is_refused_the_next_mode_is_asked_for_and_told(dialect, mode
     (ARDUPILOT, 'LAND', False, 'GUIDED'), (ARDUPILOT, 'STABILIZE', False, ''),
     (PX4, 'OFFBOARD', False, 'AUTO.LOITER'), (PX4, 'OFFBOARD', True, ''),
     (PX4, 'AUTO.LAND', True, 'AUTO.LOITER'), (PX4, 'POSCTL', False, '')])
-def test_out_of_a_mode_that_does_not_arm_it_is_brought_before_arming(
+def test_mode_that_does_not_arm_is_left_before_arming(
         dialect, mode, streaming, before):
     ready = shows(before or mode, False)
     request, sent = play(lambda dialect: arm(dialect, mode, streaming), [
@@ -206,7 +206,7 @@ def test_out_of_a_mode_that_does_not_arm_it_is_brought_before_arming(
 
 @pytest.mark.parametrize(('dialect', 'climbing', 'land'), [
     (PX4, 'AUTO.TAKEOFF', 'AUTO.LAND'), (ARDUPILOT, 'GUIDED', 'LAND')])
-def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_failed(
+def test_take_off_beyond_its_time_ends_in_landing_and_fails(
         dialect, climbing, land):
     # The height that it is told has jumped.
     script = [*every(shows(climbing), 17.3, ACCEPTED), (18.0, shows(land)), (18.1, shows(land))]

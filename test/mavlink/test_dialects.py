@@ -84,7 +84,7 @@ def test_a_heartbeat_tells_arming_and_mode(dialect, base, custom, status):
     assert dialect.status(heartbeat(dialect.firmware, QUADROTOR, base, custom)) == status
 
 
-def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
+def test_px4_takes_off_above_sea_and_arducopter_above_home():
     px4 = PX4.takeoff_parameters(2.0, 488.0, -0.8)
     assert px4[6] == 490.0 and all(math.isnan(p) for p in px4[3:6])
     assert math.isnan(PX4.takeoff_parameters(2.0, None, 0.0)[6])

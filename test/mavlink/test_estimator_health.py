@@ -66,7 +66,7 @@ def test_an_estimator_says_whether_it_has_a_velocity(dialect, flags, has_velocit
     (UNAIDED, ('POS_HORIZ_ABS', 'PRED_POS_HORIZ_REL')),
     (GONE, ('VELOCITY_HORIZ', 'POS_HORIZ_REL', 'POS_HORIZ_ABS', 'PRED_POS_HORIZ_REL')),
     (0x03fe, ('ATTITUDE',))])
-def test_the_flags_that_an_estimator_lacks_are_named_as_mavlink_names_them(
+def test_missing_estimator_flags_are_named_as_in_mavlink(
         dialect, flags, missing):
     status = estimator_status(MESSAGES[dialect.name](flags), dialect, 5.0)
     assert status.missing == missing
@@ -105,7 +105,7 @@ LOST = fixes(1, 6, 1, 1)
     # and where its estimator does not miss the fix for long, something else.
     (GOOD, LOST, math.inf, 16.0, 'rests on GPS, whose fix is lost'),
     (GOOD._replace(time=16.0), LOST, math.inf, 16.1, '')])
-def test_it_is_distrusted_from_what_it_rests_on_and_from_what_the_estimator_says(
+def test_it_is_distrusted_by_its_source_and_by_estimator_flags(
         status, gps, forwarded, now, why):
     assert velocity_fault(status, gps, forwarded, now) == why
 

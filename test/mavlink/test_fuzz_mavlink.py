@@ -29,7 +29,7 @@ BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
 
 @BOTH
-def test_no_byte_stops_the_bridge_or_gets_a_bad_setpoint_out_of_it(personality):
+def test_no_bytes_stop_bridge_or_yield_bad_setpoint(personality):
     under_fire = fuzz_bridge(220_000, 1, personality)
     # The fuzzing reached what it is for: the vehicle obeyed, commands passed, others did not.
     assert under_fire.sent['SET_POSITION_TARGET_LOCAL_NED'] > 100

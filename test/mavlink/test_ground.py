@@ -36,7 +36,7 @@ def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
 
 
 @pytest.mark.parametrize('height', [0.2, None])
-def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(height):
+def test_landed_report_near_ground_ends_permission_after_1_s(height):
     control = Gate(velocity_source='odom')
     control.permit(Permission().request(0.0))
     ended = []

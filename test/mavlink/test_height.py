@@ -72,14 +72,14 @@ def test_a_climb_is_followed_whatever_the_odometry_says_of_it(rate):
 
 
 @pytest.mark.parametrize('lacks', [0.0, 0.3, -0.3])
-def test_the_other_source_is_corrected_within_seconds_and_hardly_disturbed(lacks):
+def test_other_source_is_corrected_in_seconds_hardly_disturbed(lacks):
     heights, _ = flown(20.0, altitude=lambda t: 100.0 + lacks * t)
     assert heights.correct(2.0, 20.0) == pytest.approx(2.0 + lacks, abs=0.05)
     assert heights.correct(2.0, 20.0 + HEIGHT_TIMEOUT) == 2.0
 
 
 @pytest.mark.parametrize('jump', [0.5, -0.5, 2.0, 30.0])
-def test_a_jump_without_matching_velocity_shifts_the_reference_and_is_counted(jump):
+def test_jump_without_matching_velocity_shifts_reference_counted(jump):
     heights, found = flown(20.0, lambda t: jump * (t > 10.0))
     assert 10.0 < heights.stepped < 10.3 and abs(found[-1]) < 0.2
     assert max(abs(h) for h in found[60:]) < 0.35 * max(1.0, abs(jump) / 2.0)
@@ -109,7 +109,7 @@ def test_a_height_that_is_old_or_has_no_reference_is_unknown():
 
 @pytest.mark.parametrize('referenced', [False, True])
 @pytest.mark.parametrize('first', [1, 4, 12])
-def test_another_sensor_takes_over_without_a_jump_of_height_or_climb_rate(first, referenced):
+def test_other_sensor_takes_over_without_jump_of_height(first, referenced):
     # A bridge restarted in flight: the rangefinder's messages come before the barometer's.
     heights = HeightEstimator()
     for k in range(200):
@@ -125,7 +125,7 @@ def test_another_sensor_takes_over_without_a_jump_of_height_or_climb_rate(first,
     assert math.isinf(heights.stepped)
 
 
-def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
+def test_sensor_that_replaces_a_long_silent_one_has_no_reference():
     heights = HeightEstimator()
     heights.take(2.0, None, 0.0, 'DISTANCE_SENSOR')
     heights.refer(2.0, 0.0)
@@ -136,7 +136,7 @@ def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
         Obstacle.HEIGHT_STALE)
 
 
-def test_a_jump_of_the_barometer_corrects_the_vertical_velocity_by_its_bound_at_most():
+def test_barometer_jump_corrects_climb_by_its_bound_at_most():
     heights = HeightEstimator()
     for k in range(100):
         now = k * PERIOD

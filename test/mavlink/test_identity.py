@@ -49,7 +49,7 @@ def position(x, y=0.0, speed=0.0):
 
 
 @pytest.mark.parametrize(('target', 'given', 'own'), [(1, 0, 1), (2, 0, 2), (7, 0, 7), (2, 9, 9)])
-def test_all_that_is_sent_bears_the_system_id_of_its_vehicle_unless_one_is_set(target, given, own):
+def test_all_messages_bear_vehicle_system_id_unless_set(target, given, own):
     bench = Bench(target_system=target, source_system=given)
     bench.beats('vehicle', system=target)
     for send in (bench.link.send_heartbeat, lambda: bench.link.request_parameter('A'),
@@ -73,7 +73,7 @@ def test_all_that_is_sent_bears_the_system_id_of_its_vehicle_unless_one_is_set(t
      'of a companion computer (system id 1, component 191)'),
     (heartbeat(mavlink.MAV_TYPE_GROUND_ROVER), 1, 1,
      "of PX4 GROUND_ROVER, which autopilot = 'auto' does not send")])
-def test_a_sender_that_is_no_vehicle_of_ours_is_named_as_what_it_is(
+def test_sender_that_is_no_vehicle_is_named_as_what_it_is(
         message, system, component, named):
     bench = Bench()
     bench.sends('line', message, system=system, component=component)
@@ -86,7 +86,7 @@ def test_a_sender_that_is_no_vehicle_of_ours_is_named_as_what_it_is(
     (VTOL, HOVERS, True), (VTOL, None, False), (VTOL, 0, False), (VTOL, FORWARD, False),
     (VTOL, mavlink.MAV_VTOL_STATE_TRANSITION_TO_FW, False),
     (VTOL, mavlink.MAV_VTOL_STATE_TRANSITION_TO_MC, False)])
-def test_a_vtol_flies_by_our_setpoints_only_while_it_is_known_to_hover(kind, state, flies):
+def test_vtol_flies_our_setpoints_only_while_it_hovers(kind, state, flies):
     assert not_hovering(kind, state).startswith(FORWARD_FLIGHT) != flies
 
 
@@ -120,7 +120,7 @@ class Twin:
 @pytest.mark.parametrize(('twin', 'evidence'), [
     ({'boot': 100.0}, 'times of boot'), ({'east': 12.0}, 'positions'), ({}, 'sequence numbers'),
     ({'boot': 100.0, 'east': 12.0, 'share': 0.7}, 'times of boot')])
-def test_two_vehicles_with_one_system_id_on_a_line_are_named_and_offboard_is_refused(
+def test_two_vehicles_with_one_id_are_named_offboard_refused(
         twin, evidence):
     flight = Flight(source='autopilot')
     Twin(flight, **twin)
@@ -145,7 +145,7 @@ def test_two_vehicles_at_two_addresses_are_named():
 
 
 @pytest.mark.parametrize('echo', [False, True])
-def test_a_second_bridge_on_the_vehicle_is_named_and_an_echo_of_ours_is_not(echo):
+def test_second_bridge_on_vehicle_is_named_our_echo_is_not(echo):
     bench, other = Bench(), mavlink.MAVLink(None, 1, 191)
     ours = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3)
     for second in range(1, 6):

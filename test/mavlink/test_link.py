@@ -63,7 +63,7 @@ class Bench:
         return mavlink.MAVLink(None).decode(bytearray(data))
 
 
-def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
+def test_nothing_is_sent_before_autopilot_is_received():
     bench = Bench()
     link = bench.link
     assert not link.send_heartbeat() and bench.beats('vehicle') == ['HEARTBEAT']
@@ -88,7 +88,7 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
     ({'component': 42}, PX4, '1 of component 42, not of an autopilot'),
     ({}, mavlink.MAV_AUTOPILOT_GENERIC,
      "1 of GENERIC QUADROTOR, which autopilot = 'auto' does not send")])
-def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_answered(
+def test_other_vehicle_gimbal_or_firmware_is_named_not_answered(
         who, autopilot, silence):
     bench = Bench()
     assert bench.beats('other', autopilot, **who) == []
@@ -96,7 +96,7 @@ def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_an
     assert bench.link.silence() == f'received, but not used: {silence}'
 
 
-def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent():
+def test_second_vehicle_with_same_id_waits_for_first_to_end():
     bench = Bench()
     for vehicle, now, received, answered in (
             ('first', 1.0, ['HEARTBEAT'], 'first'), ('second', 2.0, [], 'first'),
@@ -105,7 +105,7 @@ def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent()
     assert bench.link.ignored['second sender'] == 1 and bench.link.peer_changes == 1
 
 
-def test_a_vehicle_that_loses_only_its_heartbeats_is_not_replaced():
+def test_vehicle_that_loses_only_heartbeats_is_not_replaced():
     bench = Bench()
     bench.beats('first', now=1.0)
     home = mavlink.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
@@ -118,7 +118,7 @@ def test_a_vehicle_that_loses_only_its_heartbeats_is_not_replaced():
     assert 'HOME_POSITION' not in bench.link.telemetry.newest
 
 
-def test_garbage_and_floods_of_another_sender_cost_the_vehicle_nothing():
+def test_garbage_and_floods_of_others_cost_vehicle_nothing():
     bench = Bench()
     assert bench.beats('vehicle') == ['HEARTBEAT']
     bench.link.transport.arrived += [(b'\xfd\x20\x00\x00half a message', 'noise'),
@@ -145,7 +145,7 @@ def test_signed_links_hear_only_their_key_and_time(key, at, received):
         assert bench.link.transport.written[0][2] & mavlink.MAVLINK_IFLAG_SIGNED
 
 
-def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out():
+def test_signed_message_from_far_future_does_not_lock_out():
     bench = Bench(signing=Signing(KEY, UNIX))
     bench.beats('vehicle', now=100.0, signing=Signing(KEY, UNIX))
     for ahead, now, received in ((86400.0, 101.0, False), (1.0, 101.0, True), (59.0, 100.0, True),
@@ -155,7 +155,7 @@ def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out():
         assert bool(bench.beats('vehicle', now=now)) == received
 
 
-def test_a_signed_link_follows_a_clock_that_is_set_after_the_start():
+def test_signed_link_follows_clock_set_after_start():
     started = 1_000.0  # s since 1970: a computer without a battery for its clock
     bench = Bench(signing=Signing(KEY, started))
     assert not bench.beats('vehicle', now=100.0, signing=Signing(KEY, UNIX))
@@ -257,7 +257,7 @@ def test_no_more_messages_are_taken_than_were_asked_for():
         assert unending.looks <= MOST_FALSE_STARTS + 1
 
 
-def test_an_unsigned_message_is_refused_by_a_signed_parser_and_costs_no_other():
+def test_unsigned_message_is_refused_by_signed_parser_alone():
     signed = messages(1, signing(mavlink.MAVLink(None, 1, 1)))[0]
     assert hashlib.sha256(bytes(32) + signed[:-6]).digest()[:6] == signed[-6:]
     parser = Framer(signing(Codec(None)))

@@ -104,7 +104,7 @@ def one_way(**options):
 
 
 @BOTH
-def test_a_line_on_which_nothing_arrives_at_the_autopilot_is_named_and_refuses_offboard(
+def test_line_dead_toward_autopilot_is_named_offboard_refused(
         personality):
     # With the check of the failsafe switched off, too.
     flight = Flight(personality, **one_way(bridge={'require_failsafe': False}))
@@ -135,7 +135,7 @@ def test_a_line_that_breaks_in_flight_stops_no_flight():
     ('GPS_GLOBAL_ORIGIN', {'GPS_GLOBAL_ORIGIN'}, without_gps('px4')),
     ('PARAM_VALUE', {'parameter COM_OF_LOSS_T', 'parameter COM_OBL_RC_ACT',
                      'parameter MIS_TAKEOFF_ALT'}, {})])
-def test_a_flight_whose_answers_to_one_question_are_lost_knows_the_others(
+def test_lost_answers_to_one_question_leave_others_known(
         dropped, unknown, options):
     flight = Flight(start='landed', **options, faults=[
         Fault('drop', 0.0, direction='sent', message=dropped)])

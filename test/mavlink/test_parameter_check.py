@@ -111,7 +111,7 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     assert obstacle(dialect, checked(needed=NEEDED, **values), True) == ''
 
 
-def test_both_forms_of_file_are_read_and_a_line_that_is_no_parameter_is_named():
+def test_both_file_forms_are_read_bad_line_is_named():
     text = '# A file.\n\n# why\n# it matters\n1\t1\tA\t0.5\t9\nB 3\nC,-1\n'
     assert [entry[:3] for entry in read_recommendations(text, forwarding=True)] == [
         ('A', 0.5, 'why it matters'), ('B', 3.0, ''), ('C', -1.0, '')]
@@ -123,7 +123,7 @@ def test_both_forms_of_file_are_read_and_a_line_that_is_no_parameter_is_named():
     ('<i', INT32, 15), ('<i', INT32, -1), ('<I', mavlink.MAV_PARAM_TYPE_UINT32, 70000),
     ('<h', mavlink.MAV_PARAM_TYPE_INT16, -5), ('<H', mavlink.MAV_PARAM_TYPE_UINT16, 40000),
     ('<b', mavlink.MAV_PARAM_TYPE_INT8, -2), ('<B', mavlink.MAV_PARAM_TYPE_UINT8, 200)])
-def test_px4_puts_the_bytes_of_an_integer_where_the_float_belongs(form, kind, value):
+def test_px4_puts_integer_bytes_into_the_float_field(form, kind, value):
     as_float = struct.unpack('<f', struct.pack(form, value).ljust(4, b'\0'))[0]
     # As it arrives: packed, sent, and unpacked.
     data = answer('A', as_float, kind).pack(mavlink.MAVLink(None, 1, 1))
@@ -166,7 +166,7 @@ def test_the_parameters_of_px4_are_those_of_its_version(series, sticks, estimate
         0.5, 1.0]
 
 
-def test_parameters_are_asked_for_one_at_a_time_and_compared_once_all_are_answered():
+def test_parameters_are_asked_singly_and_compared_once_complete():
     check = check_of(A, B, C)
     assert [check.step(now) for now in (0.0, 0.1, 0.2, 0.3)] == ['A', 'B', 'C', '']
     check.take(answer('A', 2.0))
@@ -180,7 +180,7 @@ def test_parameters_are_asked_for_one_at_a_time_and_compared_once_all_are_answer
     assert [checked(fence, FENCE=value).result().differing for value in (37.0, 0.0)] == [0, 1]
 
 
-def test_a_parameter_without_answer_does_not_hide_those_that_differ():
+def test_unanswered_parameter_does_not_hide_those_that_differ():
     check, asked = check_of(A, needed=['GUID_TIMEOUT']), []
     for tenth in range(51):
         asked += filter(None, [check.step(tenth / 10)])
@@ -197,7 +197,7 @@ def test_a_parameter_without_answer_does_not_hide_those_that_differ():
 NEW = Recommendation('NEW', 1.0, 'why NEW', since=(4, 7))
 
 
-def test_the_version_is_asked_for_until_it_is_answered_and_decides_what_is_asked_for():
+def test_version_is_asked_until_answered_and_decides_questions():
     check = check_of(A, NEW, firmware=None)
     assert [check.version_due(now) for now in (0.0, 0.1, 1.9, 2.0)] == [True, False, False, True]
     assert [check.step(now) for now in (0.0, 0.1)] == ['A', '']
@@ -224,7 +224,7 @@ def test_a_version_for_which_no_values_are_known_is_reported(firmware, known):
         f'{check.firmware}: the recommended values are known for PX4 1.14 to 1.18'))
 
 
-def test_a_parameter_that_does_not_exist_is_an_answer_and_the_remedy_names_the_version():
+def test_missing_autopilot_parameter_is_an_answer_with_version():
     check = check_of(
         A, needed=['COM_OF_LOSS_T', 'COM_OBL_RC_ACT'], dialect=PX4, firmware=(1, 18, 2))
     for name in (check.step(0.0), check.step(0.1), check.step(0.2)):
@@ -273,7 +273,7 @@ def test_a_flight_asks_each_version_for_its_own_parameters(firmware, asked, not_
     (ARDUPILOT, 'VISO_TYPE', (1, 2, 3), (), (0,)),
     (ARDUPILOT, 'EK3_SRC1_POSXY', (6,), (), (0, 3)),
     (ARDUPILOT, 'EK3_SRC1_VELXY', (6,), (), (0, 3, 5))])
-def test_what_is_dangerous_or_does_not_fuse_what_is_forwarded_forbids_offboard(
+def test_dangerous_or_unfused_settings_forbid_offboard(
         dialect, name, allowed, dangerous, not_fused):
     for value in (*allowed, *dangerous, *not_fused):
         check = checked(needed=NEEDED, **ALLOWED[dialect.name] | {name: value})

@@ -98,7 +98,7 @@ def make_stream():
         stream.stop()
 
 
-def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream):
+def test_arrivals_and_actions_are_done_at_once_in_one_thread(make_stream):
     bridge, stream, passed = make_stream(NEVER)
     bridge.theirs.send(b'x')
     bridge.wait_for('receive', 1 - len(bridge.times('receive')))
@@ -113,7 +113,7 @@ def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream)
     assert len(bridge.times('cycle')) == 1 and bridge.calls[-1][0] == 'odometry'
 
 
-def test_a_new_command_is_sent_at_once_and_the_next_cycle_comes_a_period_later(make_stream):
+def test_new_command_is_sent_at_once_next_cycle_a_period_later(make_stream):
     bridge, stream, _ = make_stream(0.5)
     time.sleep(0.1)
     stream.submit(bridge.take_command)
@@ -136,7 +136,7 @@ def test_new_commands_make_at_most_one_setpoint_per_20_ms(make_stream, period):
     assert period < SHORTEST_PERIOD or min(np.diff(begun)) >= SHORTEST_PERIOD
 
 
-def test_a_flood_of_actions_neither_starves_the_cycle_nor_grows_without_end(make_stream):
+def test_flood_of_actions_neither_starves_cycle_nor_grows(make_stream):
     bridge, stream, _ = make_stream(0.01)
     refused = threading.Event()
 
@@ -150,7 +150,7 @@ def test_a_flood_of_actions_neither_starves_the_cycle_nor_grows_without_end(make
     bridge.wait_for('cycle', 20)
 
 
-def test_every_action_that_was_taken_is_run_or_refused_at_the_end(make_stream):
+def test_every_action_taken_is_run_or_refused_at_end(make_stream):
     bridge, stream, _ = make_stream(0.01)
     answers = []
 
@@ -168,7 +168,7 @@ def test_every_action_that_was_taken_is_run_or_refused_at_the_end(make_stream):
     assert not submit(501)
 
 
-def test_neither_a_device_that_is_away_nor_a_cycle_that_raises_ends_the_cycles(make_stream):
+def test_missing_device_or_raising_cycle_ends_no_cycles(make_stream):
     bridge, _, passed = make_stream(0.01)
     bridge.fault, bridge.broken = 'unplugged', True
     bridge.wait_for('receive', 3)

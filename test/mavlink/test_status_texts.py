@@ -73,7 +73,7 @@ def test_a_refusal_is_explained_by_more_than_information():
     assert texts.new(1.0) == [(1.0, INFO, 'merely information')] and texts.since(1.0) == []
 
 
-def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_again():
+def test_arming_obstacle_is_kept_until_its_next_report_is_due():
     texts = StatusTexts()
     for time, text in ((1.0, 'PreArm: Hardware safety switch'), (1.5, 'EKF3 IMU0 is using GPS'),
                        (2.0, 'PreArm: RC not found')):
@@ -123,7 +123,7 @@ def test_a_failed_check_has_its_text_or_its_number(name, reason):
     ('check_estimator_position_failure_imminent', AUTOPILOT,
      ['estimator position failure imminent']),
     (4711, AUTOPILOT, ['event 4711']), (1100, COMMON, []), (OTHERS[0], AUTOPILOT, [])])
-def test_an_event_of_the_commander_is_told_by_its_text_or_its_number(number, component, texts):
+def test_commander_event_is_named_by_text_or_number(number, component, texts):
     assert told(event(number, component=component)) == (texts, [])
 
 
@@ -190,7 +190,7 @@ def test_a_state_is_reported_once_after_it_has_lasted_a_second():
     assert sent_texts(report, 21.0) == [(WARNING, 'flock: HOLD')]
 
 
-def test_there_is_at_most_one_text_in_two_seconds_and_a_handover_goes_first():
+def test_one_text_at_most_in_two_seconds_handover_first():
     report = GroundStationReport()
     report.take_state('SEARCH', 0.0)
     assert sent_texts(report, 1.0) == [(INFO, 'flock: SEARCH')]
@@ -201,7 +201,7 @@ def test_there_is_at_most_one_text_in_two_seconds_and_a_handover_goes_first():
     assert sent_texts(report, 4.9) == [] and sent_texts(report, 5.0) == [(WARNING, 'flock: HOLD')]
 
 
-def test_distances_are_sent_once_a_second_while_they_are_new_and_finite():
+def test_distances_are_sent_each_second_while_new_and_finite():
     report, sent = GroundStationReport(), []
     for k in range(100):
         now = 0.1 * k

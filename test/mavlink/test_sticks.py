@@ -82,7 +82,7 @@ def test_a_stick_takes_over_fast_or_slow(message, axis, seconds, end, soonest, l
 
 
 @pytest.mark.parametrize('rest', [-1.0, 0.0, 0.4])
-def test_the_throttle_takes_over_only_when_it_comes_to_its_center(rest):
+def test_throttle_takes_over_only_at_its_center(rest):
     still = REST._replace(throttle=rest)
     away = ramp(0.5, 0.9 if rest <= 0.0 else -0.9, begin=rest)
     away = away[np.abs(away) > 0.1]  # through the center between two messages
@@ -163,7 +163,7 @@ def test_messages_on_both_sides_of_a_gap_are_not_consecutive():
         assert watch.moved is moved, now
 
 
-def test_values_that_a_receiver_is_set_to_do_not_count_beside_manual_control():
+def test_receiver_values_do_not_count_beside_manual_control():
     watch = StickWatch(0.3)
     for now in np.arange(0.0, 1.0, 0.1):
         watch.take(manual_control(REST), now)

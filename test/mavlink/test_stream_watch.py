@@ -40,7 +40,7 @@ def arrived(*times):
     return arrivals
 
 
-def test_rate_and_longest_pause_are_those_of_the_last_five_seconds():
+def test_rate_and_longest_pause_cover_last_five_seconds():
     arrivals = arrived(*(t for t in np.arange(0.0, 20.0, 0.02) if not 16.0 < t < 16.5))
     assert arrivals.rate(POSITION, 20.0) == pytest.approx(45.0, abs=0.5)
     assert arrivals.rate(0, 20.0) == Arrivals().longest_pause(7.0) == 0.0
@@ -50,7 +50,7 @@ def test_rate_and_longest_pause_are_those_of_the_last_five_seconds():
 
 @pytest.mark.parametrize('wanted', [5.0, 50.0, 200.0])
 @pytest.mark.parametrize(('share', 'low'), [(0.0, True), (0.3, True), (0.8, False), (1.5, False)])
-def test_what_comes_well_below_the_rate_asked_for_comes_too_seldom(wanted, share, low):
+def test_rate_well_below_request_is_too_low(wanted, share, low):
     period = 1.0 / (share * wanted) if share else 100.0
     arrivals = arrived(*np.arange(0.0, 10.0, period))
     # Wherever the window begins: one message more or less is chance.
@@ -75,7 +75,7 @@ def sets_rate(flight, message_id, hertz):
 @pytest.mark.parametrize(('personality', 'message_id', 'hertz', 'seconds'), [
     # HEARTBEAT shows the pilot's switch.
     ('px4', POSITION, 4.0, 1.0), ('arducopter', 0, 0.4, 5.0)])
-def test_all_is_asked_for_at_the_start_and_what_another_one_lowers_again(
+def test_all_is_requested_at_start_and_when_another_lowers_it(
         personality, message_id, hertz, seconds):
     flight = Flight(personality)
     flight.fly(1.0 + STREAM_REQUEST_PERIOD)

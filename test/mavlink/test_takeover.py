@@ -103,7 +103,7 @@ FAILSAFE = 0.0, mode(PX4, 'AUTO.RTL', 'OFFBOARD')
     ([FAILSAFE, (STREAM_AFTER + 0.1, event('check_modes_offboard_signal'))], failsafe(UNNAMED)),
     ([FAILSAFE, (EVIDENCE_AFTER + 0.1, entered(3))], failsafe(UNNAMED)),
     ([(-BEFORE - 0.1, entered(3)), FAILSAFE], failsafe(UNNAMED))])
-def test_on_px4_the_chosen_mode_shows_a_pilot_and_events_name_a_failsafe(messages, cause):
+def test_px4_mode_shows_pilot_and_events_name_failsafe(messages, cause):
     assert judged(PX4, *messages) == cause
 
 
@@ -116,13 +116,13 @@ def test_on_px4_the_chosen_mode_shows_a_pilot_and_events_name_a_failsafe(message
     ('Max Alt fence breached', 'BRAKE', failsafe(FENCE)),
     ('EKF Failsafe: changed to LAND Mode', 'LAND', failsafe(ESTIMATE)),
     ('Glitch cleared', 'LAND', UNKNOWN)])
-def test_on_ardupilot_a_text_names_a_failsafe_and_some_modes_show_a_pilot(words, flown, cause):
+def test_ardupilot_text_names_failsafe_some_modes_show_pilot(words, flown, cause):
     shown = 0.0, mode(ARDUPILOT, flown)
     for messages in ([(-0.2, text(words)), shown], [shown, (0.5, text(words))]):
         assert judged(ARDUPILOT, *messages) == cause
 
 
-def test_the_failsafe_of_the_real_ardupilot_without_vision_is_named():
+def test_failsafe_of_real_ardupilot_without_vision_is_named():
     watch, left = TakeoverWatch(), None
     for time, message in decoded('ardupilot_vision_lost'):
         if (message.get_srcSystem(), message.get_srcComponent()) != (1, 1):

@@ -139,7 +139,7 @@ def test_heights_are_known_above_the_sea_and_the_local_origin():
 # CURRENT_MODE shows the pilot's switch at once.
 
 
-def test_current_mode_tells_the_mode_and_leaves_the_rest_to_heartbeat():
+def test_current_mode_sets_mode_and_leaves_rest_to_heartbeat():
     assert received(mode_message('OFFBOARD')).status is None
     telemetry = received(heartbeat('OFFBOARD'), mode_message('POSCTL'))
     assert telemetry.status == (True, 'POSCTL', False)

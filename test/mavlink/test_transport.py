@@ -72,7 +72,7 @@ def carries(transport, far_end):
     assert transport.write(b'back') and os.read(far_end, 10) == b'back'
 
 
-def test_a_serial_device_that_is_away_is_reported_and_opened_when_it_comes(terminal):
+def test_missing_serial_device_is_reported_and_opened_later(terminal):
     plug, make, unlink = terminal
     transport = make()
     for lost_at in (1.0, 10.0):
@@ -92,7 +92,7 @@ def test_a_serial_device_that_is_away_is_reported_and_opened_when_it_comes(termi
         transport.reopen(lost_at + 5.0)
 
 
-def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(terminal):
+def test_what_does_not_fit_is_refused_whole(terminal):
     plug, make, _ = terminal
     main, _ = plug()
     transport, sent, message = make(), 0, bytes(range(256)) * 4
@@ -122,7 +122,7 @@ def test_a_port_is_8n1_without_flow_control_however_it_was_left(terminal):
     assert wait(transport) == bytes(range(256))
 
 
-def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal):
+def test_serial_port_has_one_user_next_is_told_who_waits(terminal):
     plug, make, _ = terminal
     main, replica = plug()
     first, second = make(), make()
@@ -136,7 +136,7 @@ def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal):
     carries(second, main)
 
 
-def test_tcp_connects_when_somebody_listens_again_after_a_close_and_holds_odometry_back():
+def test_tcp_reconnects_and_holds_odometry_back():
     server = socket.socket()
     server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2304)
     server.bind(('127.0.0.1', 0))
@@ -201,7 +201,7 @@ def test_a_port_in_use_is_named():
     first.close()
 
 
-def test_an_address_that_no_interface_has_yet_is_reported_and_listened_on_later(monkeypatch):
+def test_address_without_interface_is_reported_then_listened_on(monkeypatch):
     bind, taken = socket.socket.bind, []
 
     class Late(socket.socket):
@@ -219,7 +219,7 @@ def test_an_address_that_no_interface_has_yet_is_reported_and_listened_on_later(
     transport.close()
 
 
-def test_a_datagram_that_cannot_be_sent_is_reported_with_its_remedy_until_one_is(monkeypatch):
+def test_unsendable_datagram_is_reported_with_remedy_until_sent(monkeypatch):
     transport = open_transport('udpout:255.255.255.255:14550')  # without the right to broadcast
     assert not transport.write(b'x')
     assert '(EACCES): a broadcast address' in transport.fault

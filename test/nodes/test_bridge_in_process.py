@@ -188,7 +188,7 @@ def test_only_the_setpoint_thread_calls_what_changes_the_bridge(make_bench):
     assert {thread for _, thread in bench.calls} == {'stream'}
 
 
-def test_a_command_leaves_in_ned_and_one_that_must_not_fly_is_counted(make_bench):
+def test_command_leaves_in_ned_and_refused_one_is_counted(make_bench):
     bench = make_bench()
     bench.fly()
     bench.odometry()
@@ -204,7 +204,7 @@ def test_a_command_leaves_in_ned_and_one_that_must_not_fly_is_counted(make_bench
     assert counters['command not finite'] == 1
 
 
-def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_brakes(make_bench):
+def test_limits_only_fall_in_flight_second_commander_brakes(make_bench):
     bench = make_bench()
     bench.fly()
     assert bench.set(a_max=1.5) == '' and 'can only be lowered' in bench.set(a_max=2.0)
@@ -222,7 +222,7 @@ def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_br
     assert Situation.from_json(line).report.armed
 
 
-def test_offboard_is_refused_while_two_nodes_may_command_and_their_files_are_named(make_bench):
+def test_two_commanding_nodes_refuse_offboard_files_are_named(make_bench):
     bench, ends = make_bench(), []
     bench.node.get_publishers_info_by_topic = (
         lambda topic: ends if topic == '/command/trajectory' else [])
@@ -246,7 +246,7 @@ def test_offboard_is_refused_while_two_nodes_may_command_and_their_files_are_nam
     assert nodes.split()[0] not in bench.ask('offboard', True).message
 
 
-def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(make_bench):
+def test_it_publishes_estimate_battery_and_place_of_arming(make_bench):
     bench = make_bench()
     bench.beat(armed=False)
     bench.wait(lambda: bench.bridge.telemetry.status)
@@ -271,7 +271,7 @@ def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(
     assert 'INACTIVE: offboard was not requested' in {state.data for state in states}
 
 
-def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_bench):
+def test_odometry_keeps_its_age_on_arrival_however_long_queued(make_bench):
     bench = make_bench()
     bench.odometry(late=150_000_000)
     known = bench.bridge.gate.motion.odometry
@@ -298,7 +298,7 @@ def test_a_publisher_that_waits_does_not_hold_the_setpoints_up(make_bench):
     assert bench.values['dropped: publishing took too long'] == 0
 
 
-def test_a_request_that_fails_inside_is_answered_and_the_stream_goes_on(make_bench):
+def test_request_that_raises_is_answered_and_stream_goes_on(make_bench):
     bench = make_bench()
     bench.bridge.requests.land = lambda now: 1 / 0
     answer = bench.ask('land')
@@ -333,7 +333,7 @@ def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
         assert not response.success and response.message == 'refused: the bridge is stopping'
 
 
-def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
+def test_faults_of_autopilot_and_link_are_reported(make_bench):
     bench = make_bench(forward_odometry=True)
     assert 'nothing arrives' in bench.problems(ahead=4.0)
     bench.codec.srcSystem = 7
@@ -360,7 +360,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     assert 'autopilot lost on' in bench.problems(ahead=60.0)
 
 
-def test_a_slow_link_heights_that_differ_and_a_landing_by_the_bridge_are_reported(make_bench):
+def test_slow_link_differing_heights_and_landing_are_reported(make_bench):
     bench = make_bench()
     bench.receive()
     bench.wait(lambda: bench.bridge.telemetry.attitude and bench.problems())
@@ -401,7 +401,7 @@ def test_a_take_off_of_ardupilot_misses_no_setpoint(make_bench):
     assert not reported(mavlink.MAV_LANDED_STATE_IN_AIR)
 
 
-def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_reported(
+def test_differing_autopilot_parameters_and_limits_are_reported(
         make_bench):
     bench = make_bench()
     line = 'COM_OF_LOSS_T = 1, recommended 0.5: why'
@@ -445,7 +445,7 @@ def test_a_node_with_other_parameters_in_flight_is_named(make_bench, name, armed
     assert ('d0 1.0 -> 2.0' in bench.problems()) == armed
 
 
-def test_the_timestamps_of_signatures_follow_a_clock_that_is_set_after_the_start(
+def test_signature_timestamps_follow_clock_set_after_start(
         make_bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'key').write_bytes(bytes(32))
     (tmp_path / 'key').chmod(0o600)
@@ -456,7 +456,7 @@ def test_the_timestamps_of_signatures_follow_a_clock_that_is_set_after_the_start
     bench.wait(lambda: bench.bridge.link.signing.state.timestamp > 3e13)  # 10 years of 10 us
 
 
-def test_a_line_that_cannot_send_is_named_while_the_autopilot_is_received(make_bench):
+def test_line_that_cannot_send_is_named_while_it_receives(make_bench):
     bench = make_bench()
     bench.beat()
     bench.wait(lambda: bench.bridge.alive(time.monotonic()))

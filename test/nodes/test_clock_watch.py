@@ -31,7 +31,7 @@ def clocks(seconds: float, step: float = 0.0) -> tuple[int, float]:
     return START + round((seconds + step) * SECOND), 100.0 + seconds
 
 
-def test_a_clock_that_is_slewed_or_read_a_little_late_was_not_set() -> None:
+def test_slewed_or_late_clock_does_not_count_as_set() -> None:
     watch, rng = ClockWatch(), np.random.default_rng(1)
     for tick in range(1000):
         system, monotonic = clocks(0.1 * tick, 0.0005 * tick)  # 5 ms per second
@@ -40,7 +40,7 @@ def test_a_clock_that_is_slewed_or_read_a_little_late_was_not_set() -> None:
 
 
 @pytest.mark.parametrize('step', STEPS)
-def test_what_was_stamped_before_a_step_is_known_for_as_long_as_it_may_come(step: float) -> None:
+def test_stamps_before_a_step_are_known_while_they_may_come(step: float) -> None:
     watch = ClockWatch()
     for tick in range(11):
         watch.take(*clocks(0.1 * tick))

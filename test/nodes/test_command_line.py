@@ -47,7 +47,7 @@ def run(node: str, *arguments: str) -> int:
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_help_describes_a_node_and_its_parameters_and_starts_nothing(
+def test_help_describes_node_and_parameters_starts_nothing(
         node: str, capsys: pytest.CaptureFixture[str]) -> None:
     for option in ('--help', '-h'):
         assert run(node, option) == 0
@@ -57,7 +57,7 @@ def test_help_describes_a_node_and_its_parameters_and_starts_nothing(
             assert f'\n  {spec.name} ' in out
 
 
-def test_a_node_is_destroyed_once_it_is_spun_and_not_by_the_signal() -> None:
+def test_node_is_destroyed_after_spin_not_by_signal() -> None:
     order = []
 
     class Noted(Node):
@@ -139,7 +139,7 @@ def test_a_file_that_cannot_be_read_is_refused_by_name(
     assert str(path) in refused(capfd, node, '--ros-args', *f'{option}{path}'.split())
 
 
-def test_a_wrong_scenario_file_is_refused_with_file_key_and_the_valid_values(
+def test_wrong_scenario_is_refused_with_file_key_and_values(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('summary: mine\nleader:\n  motion: loop\n')
@@ -147,7 +147,7 @@ def test_a_wrong_scenario_file_is_refused_with_file_key_and_the_valid_values(
         capfd, 'simulator', '--ros-args', '-p', f'scenario:={path}')
 
 
-def test_a_parameter_file_that_misses_the_node_ends_it_or_is_a_warning(
+def test_parameter_file_without_node_ends_it_or_warns(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('planners: {ros__parameters: {odom_twist_frame: odom}}')

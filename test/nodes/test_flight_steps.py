@@ -67,7 +67,7 @@ class Desk:
         return self.flight.end(INTERRUPTED, self.reports, insist)
 
 
-def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> None:
+def test_each_step_waits_for_its_key_and_its_report() -> None:
     desk = Desk(GROUND, HOVER, False)
     for step, before, after in (('arm', (GROUND, HOVER), (ARMED, HOVER)),
                                 ('takeoff', (ARMED, HOVER), (AIR, HOVER)),
@@ -91,7 +91,7 @@ def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> 
     assert f'{MODE_LEFT}: failsafe: fence' in desk.reports.line(desk.now)
 
 
-def test_without_keys_each_step_is_requested_once_and_a_refusal_ends_the_flight() -> None:
+def test_steps_without_keys_are_requested_once_refusal_ends() -> None:
     desk = Desk(GROUND, HOVER, False)
     desk.flight = Flight(desk.now, confirm=False)
     for step, before in (('arm', (GROUND, HOVER)), ('takeoff', (ARMED, HOVER)),
@@ -143,7 +143,7 @@ def test_ctrl_c_ends_what_is_under_way(step: str, vehicle: dict[str, str]) -> No
     assert desk.flight.code == 1
 
 
-def test_a_second_ctrl_c_ends_without_the_answer_and_a_second_hangup_does_not() -> None:
+def test_second_ctrl_c_ends_without_answer_second_hangup_not() -> None:
     desk = Desk(GROUND, HOVER, False)
     assert desk.end() == [] and desk.flight.code == INTERRUPTED  # on the ground at once
     desk = Desk()
@@ -152,7 +152,7 @@ def test_a_second_ctrl_c_ends_without_the_answer_and_a_second_hangup_does_not() 
     assert desk.end() == [] and desk.flight.code == INTERRUPTED
 
 
-def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None:
+def test_l_lands_from_any_airborne_step_and_ends_disarmed() -> None:
     desk = Desk(ARMED, HOVER, False)
     assert desk.press('l') == []  # on the ground
     assert desk.press('tl') == ['takeoff', 'disengage', 'land']
@@ -173,7 +173,7 @@ def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None
     assert desk.end() == ['disengage']  # the landing goes on
 
 
-def test_in_the_air_with_a_finding_of_check_it_only_lands_or_hands_over() -> None:
+def test_check_finding_in_the_air_only_lands_or_hands_over() -> None:
     """A second `follow` in flight had ended at the findings, without the key that lands."""
     desk = Desk(AIR, HOVER, False)
     desk.flight = Flight(desk.now, ready=False)
@@ -190,7 +190,7 @@ def test_in_the_air_with_a_finding_of_check_it_only_lands_or_hands_over() -> Non
     assert desk.end() == ['disengage', 'hand over']
 
 
-def test_a_missing_node_ends_it_and_without_the_autopilot_nothing_is_due() -> None:
+def test_missing_node_ends_it_without_autopilot_nothing_is_due() -> None:
     desk = Desk()
     assert desk.report(AIR, 'NO_AUTOPILOT: lost, ACTIVE before') == ''
     for vehicle in ({'armed': '', 'flying': ''}, {**ARMED, 'flying': ''}):

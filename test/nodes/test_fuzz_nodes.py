@@ -28,7 +28,7 @@ REACHED = {'planner': {'MultiDOFJointTrajectory': 100}, 'mavlink_bridge': {},
 
 
 @pytest.mark.parametrize('kind', NODES)
-def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
+def test_no_message_breaks_node_or_yields_bad_command(kind):
     count = COUNT.get(kind, 1000)
     under_fire = fuzz_node(kind, count, 1)
     for name, least in REACHED[kind].items():

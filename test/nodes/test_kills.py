@@ -24,6 +24,6 @@ import pytest
 pytestmark = pytest.mark.slow
 
 
-def test_a_kill_of_planner_perception_or_replay_brakes_within_300_ms(tmp_path: Path) -> None:
+def test_kill_of_planner_perception_or_replay_brakes_in_300_ms(tmp_path: Path) -> None:
     for victim, seconds in braking_times(len(VICTIMS), 0, tmp_path):
         assert 0.0 < seconds <= LIMIT, victim

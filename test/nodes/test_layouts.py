@@ -55,7 +55,7 @@ def topics(nodes: dict[str, Node]) -> dict[str, Any]:
             for end in (*node.publishers, *node.subscriptions)}
 
 
-def test_the_table_from_which_a_policy_is_written_is_that_of_the_nodes(
+def test_policy_table_is_that_of_the_nodes(
         nodes: dict[str, Node]) -> None:
     rows = re.findall(r'^- `(\w+)` publishes\s+(.*?);\s+subscribes\s+(.*?);\s+serves\s+(.*?)\.$',
                       PAGE.read_text(), re.M | re.S)

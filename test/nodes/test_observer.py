@@ -43,7 +43,7 @@ def test_no_arrival_is_counted_before_the_clock_is_known(ros: None, monkeypatch:
     observer.destroy_node()
 
 
-def test_poses_of_another_detector_are_taken_once_the_parameters_have_come(
+def test_foreign_poses_are_taken_once_parameters_are_read(
         ros: None, tmp_path: Path, monkeypatch: Any) -> None:
     file = tmp_path / 'neighbors.yaml'
     file.write_text('neighbors: [{name: leader, pose_topic: poses}]')

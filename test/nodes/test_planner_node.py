@@ -97,7 +97,7 @@ def rig(ros: None) -> Iterator[Rig]:
     made.close()
 
 
-def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(rig: Rig) -> None:
+def test_commands_begin_and_end_with_bridge_state_and_engaging(rig: Rig) -> None:
     message = rig.engage()
     assert message.startswith('engaged; waiting for: the bridge: INACTIVE')
     assert message.endswith('; no neighbor seen yet')
@@ -124,7 +124,7 @@ def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(ri
     assert rig.state == 'IDLE'
 
 
-def test_a_command_says_what_it_rests_on_and_points_to_the_leader(rig: Rig) -> None:
+def test_command_names_its_image_and_points_to_leader(rig: Rig) -> None:
     # A quarter turn at 1 rad/s.
     rig.fly(leader=(0.0, 2.7, 2.0), velocity=(0.0, 0.1, 0.0))
     rig.run(1.5, (0.0, 2.7, 2.0), velocity=(0.0, 0.1, 0.0))
@@ -144,7 +144,7 @@ def test_a_command_says_what_it_rests_on_and_points_to_the_leader(rig: Rig) -> N
     assert rig.acceleration()[1] > 0.1
 
 
-def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -> None:
+def test_dead_perception_brakes_at_once_not_at_next_tick(rig: Rig) -> None:
     moving = {'velocity': (0.3, 0.0, 0.0), 'yaw': np.pi / 2}  # forward is north
     north = (0.0, 2.0, 2.0)
     rig.fly(leader=north, **moving)
@@ -158,7 +158,7 @@ def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -
     assert rig.state == 'TRACK'
 
 
-def test_the_motion_without_odometry_is_flown_on_and_marks_the_commands(rig: Rig) -> None:
+def test_motion_without_odometry_is_flown_and_marks_commands(rig: Rig) -> None:
     rig.fly()
     for _ in range(40):
         rig.give(MOTION_TOPIC, to_odometry(
@@ -170,7 +170,7 @@ def test_the_motion_without_odometry_is_flown_on_and_marks_the_commands(rig: Rig
     assert rig.state == 'TRACK' and rig.commands[-1].header.frame_id == 'odom'
 
 
-def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> None:
+def test_every_other_input_arrives_unknown_ones_are_counted(rig: Rig) -> None:
     rig.run(0.1, frame='map')
     assert rig.counters['invalid neighbors'] > 0
     rig.node._loop.view = ()
@@ -198,7 +198,7 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     assert 'is /clock published?' in rig.problems(ahead=5.0)
 
 
-def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig: Rig) -> None:
+def test_parameters_are_set_in_flight_or_refused_limits_fall(rig: Rig) -> None:
     assert 'd1 = 8.0: must be a number in [d0' in rig.set(a_max=2.0, d0=9.0)
     assert 'd1 = 1.2: must be at least 2.11 m^2' in rig.set(d1=1.2)
     assert rig.node.get_parameter('a_max').value == 2.5
@@ -228,7 +228,7 @@ def test_the_frame_of_the_velocity_is_logged_when_it_is_found(rig: Rig) -> None:
     assert lines == [text] and text in rig.problems()
 
 
-def test_the_motion_without_odometry_is_as_old_as_it_was_on_arrival(ros: None) -> None:
+def test_motion_without_odometry_keeps_its_age_on_arrival(ros: None) -> None:
     rig = Driven(Planner(parameter_overrides=overrides(require_bridge=False)))
     for late in (60, 40):  # ms; both wait for the tick
         now = rig.node.get_clock().now().nanoseconds
@@ -286,7 +286,7 @@ def test_two_bridges_are_named_with_their_parameter_files(rig):
             rig.problems())
 
 
-def test_a_bridge_started_anew_in_flight_with_other_parameters_is_named(rig):
+def test_bridge_restarted_in_flight_with_other_file_is_named(rig):
     bridge = rig.node._bridge_parameters
     bridge.take({'altitude_max': 3.0})
     bridge.take({'altitude_max': 4.0})  # on the ground

@@ -38,7 +38,7 @@ def publisher(errors):
     publisher.stop()
 
 
-def test_actions_run_in_order_in_the_publisher_thread_and_one_that_raises_is_reported(
+def test_actions_run_in_order_in_publisher_thread_errors_shown(
         publisher, errors):
     reported, done = [], threading.Event()
     publisher.submit(lambda: 1 / 0)
@@ -51,7 +51,7 @@ def test_actions_run_in_order_in_the_publisher_thread_and_one_that_raises_is_rep
     assert [str(error) for error in errors] == ['division by zero']
 
 
-def test_while_one_takes_long_the_oldest_are_dropped_and_nobody_waits_for_it(publisher):
+def test_slow_one_drops_oldest_and_delays_no_other(publisher):
     begun, release, reported = threading.Event(), threading.Event(), []
     publisher.submit(lambda: (begun.set(), release.wait(DEADLINE)))
     assert begun.wait(DEADLINE)

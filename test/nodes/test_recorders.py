@@ -104,7 +104,7 @@ def numbers(path: Path) -> list[int]:
 
 
 @pytest.mark.parametrize('end', [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_black_box_has_all_but_the_last_second_and_an_interrupted_one_all(
+def test_killed_black_box_lacks_at_most_its_last_second(
         vehicle: Vehicle, tmp_path: Path, end: signal.Signals) -> None:
     process = subprocess.Popen(
         [sys.executable, '-m', 'flock_follower.nodes.black_box', '--ros-args', '-r',
@@ -124,7 +124,7 @@ def test_a_killed_black_box_has_all_but_the_last_second_and_an_interrupted_one_a
     assert found == list(range(found[0], found[-1] + 1))
 
 
-def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(
+def test_full_disk_is_reported_and_recording_resumes_with_room(
         vehicle: Vehicle, box: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -157,7 +157,7 @@ def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(
     box.node._recording.close()
 
 
-def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
+def test_recording_holds_images_latched_states_and_parameters(
         vehicle: Vehicle, box: Driven, tmp_path: Path) -> None:
     planner = Node('planner', namespace='drone1')
     planner.declare_parameter('v_max', 0.75)
@@ -199,7 +199,7 @@ def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
     assert values is not None and values['planner']['v_max'] == 0.5
 
 
-def test_in_simulated_time_the_messages_of_a_topic_keep_their_order(
+def test_messages_of_a_topic_keep_order_in_simulated_time(
         box: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
     topic, _, kind, _ = box.node._inputs[0]
     for clock, waited in ((START, 0), (START + 33_000_000, 40_000_000)):  # the clock has steps

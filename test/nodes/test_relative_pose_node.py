@@ -185,7 +185,7 @@ def test_measured_pose_is_in_the_frame_of_the_image(
     assert r.counters == {} and r.problems() == ''
 
 
-def test_a_second_print_of_its_marker_is_published_by_another_name_and_told(
+def test_second_print_is_published_by_another_name_and_reported(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     other = AHEAD @ Transform(translation=np.array([0.8, -1.0, 0.0]))
     both = np.ascontiguousarray(
@@ -205,7 +205,7 @@ def test_a_second_print_of_its_marker_is_published_by_another_name_and_told(
     assert 'in sight twice' not in r.problems(ahead=3.0)
 
 
-def test_every_image_processed_is_told_with_or_without_a_neighbor_in_it(
+def test_every_processed_image_is_reported_with_or_without_hit(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig(max_wait=0.0)
     r.image(0.0, image)  # without odometry nothing is looked for
@@ -222,7 +222,7 @@ def test_every_image_processed_is_told_with_or_without_a_neighbor_in_it(
     assert r.counters['no odometry yet'] == 1 and 'no /odom for' in r.problems(ahead=4.0)
 
 
-def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time(
+def test_image_without_odometry_is_extrapolated_or_dropped(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig(max_wait=0.05)
     r.odom(0.0)
@@ -347,7 +347,7 @@ def test_the_child_frame_of_odom_is_placed_by_tf_static(
     np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
 
 
-def test_the_motion_without_odometry_places_the_neighbor_in_its_own_frame(
+def test_motion_without_odometry_places_neighbor_in_own_frame(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     for k in range(4):
@@ -361,7 +361,7 @@ def test_the_motion_without_odometry_places_the_neighbor_in_its_own_frame(
     np.testing.assert_allclose(place, LEADER.translation - OWN.translation, atol=0.03)
 
 
-def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_on(
+def test_stopped_or_uncalibrated_camera_is_named_other_goes_on(
         ros: None) -> None:
     r = Rig(max_wait=0.0, **TWO)
     shown = r.watch('debug_image/left')

@@ -107,7 +107,7 @@ def padded(cdr: bytes) -> bytes:
     return cdr + bytes(-len(cdr) % 4)
 
 
-def test_every_message_is_sent_bit_for_bit_and_a_clock_that_knows_its_stamp(
+def test_every_message_is_sent_bit_for_bit_clock_knows_stamp(
         player: Callable[..., Player], bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     p = player(bag, 'rate:=2.0')
     latched = {}
@@ -127,7 +127,7 @@ def test_every_message_is_sent_bit_for_bit_and_a_clock_that_knows_its_stamp(
     assert np.median(np.diff(clocks)) <= 6_500_000  # 200 Hz of bag time between the messages
 
 
-def test_start_and_topics_choose_what_is_played_latched_messages_included(
+def test_start_and_topics_choose_what_is_played(
         player: Callable[..., Player], bag: Path) -> None:
     p = player(bag, 'start:=0.5', 'topics:=[stamps, /mode]',
                remaps=('__ns:=/drone', '/drone/mode:=/mode_out'))
@@ -178,7 +178,7 @@ def test_a_loop_steps_the_clock_back_and_rate_and_loop_are_live(
     assert not p.thread.is_alive() and p.node._timeline.rate == 20.0
 
 
-def test_statements_and_commands_of_the_recorded_system_are_played_only_if_named(
+def test_recorded_states_and_commands_are_played_only_if_named(
         player: Callable[..., Player], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         for topic in ('mode', '/rosout', '/drone1/command/trajectory'):

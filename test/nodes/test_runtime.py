@@ -97,7 +97,7 @@ def test_a_service_that_raises_answers_with_the_error(tested: Tested, callback: 
     assert tested.counters == {'internal error in service serve': 1}
 
 
-def test_a_check_that_raises_hides_no_other_and_the_status_is_published(tested: Tested) -> None:
+def test_check_that_raises_hides_no_other_status_is_published(tested: Tested) -> None:
     tested.diagnostics.checks += [lambda now: (WARN, 'first'), oops, lambda now: (ERROR, 'last')]
     tested.diagnostics.sources += [oops, lambda now: {'one': 1}]
     tested.diagnostics.reject('too old', 'by 3 s')
@@ -126,7 +126,7 @@ def test_a_subscription_of_rclpy_itself_is_guarded(ros: None) -> None:
     tested.close()
 
 
-def test_invalid_and_too_large_messages_are_counted_and_the_latter_not_read(
+def test_invalid_and_large_messages_are_counted_large_unread(
         tested: Tested, monkeypatch: pytest.MonkeyPatch) -> None:
     taken, read = [], []
     monkeypatch.setattr(runtime, 'deserialize_message', lambda data, kind: (
@@ -168,7 +168,7 @@ def test_the_silence_of_a_required_input_is_explained(
     context.try_shutdown()
 
 
-def test_rates_are_means_over_the_window_and_latencies_percentiles_in_milliseconds() -> None:
+def test_rates_are_window_means_latencies_percentiles_in_ms() -> None:
     rate = Rate()
     for i in range(101):
         rate.tick(i * 0.1)
@@ -179,7 +179,7 @@ def test_rates_are_means_over_the_window_and_latencies_percentiles_in_millisecon
 
 
 @pytest.mark.parametrize('kind', [Planner, MavlinkBridge, RelativePose, SharingNode, Visualizer])
-def test_no_timer_stops_if_the_system_clock_is_set_and_small_messages_have_a_size_bound(
+def test_no_timer_stops_if_clock_is_set_messages_are_bounded(
         ros: None, kind: Any) -> None:
     node = kind(parameter_overrides=overrides(**{
         MavlinkBridge: {'connection': 'udpin:127.0.0.1:0'},
@@ -232,7 +232,7 @@ def test_a_parameter_callback_that_raises_refuses_the_change(tested: Tested) -> 
     assert tested.counters['internal error on parameters'] == 1
 
 
-def test_what_a_shutdown_makes_a_callback_raise_is_no_error_of_its_own() -> None:
+def test_exception_by_shutdown_in_callback_is_no_error() -> None:
     context = rclpy.Context()
     rclpy.init(context=context)
     node = FlockNode('tested', context=context)

@@ -73,7 +73,7 @@ def test_a_reader_that_stands_still_does_not_hold_a_node_up():
         os.close(write)
 
 
-def test_a_shutdown_that_hangs_with_the_interpreter_locked_ends_all_the_same():
+def test_shutdown_hanging_with_locked_interpreter_ends():
     stuck = subprocess.Popen([sys.executable, '-c', STUCK], stdout=subprocess.PIPE,
                              env=private_environment())
     try:

@@ -43,7 +43,7 @@ TOPICS = {'image_raw': Image, 'camera_info': CameraInfo, 'odom': Odometry,
 
 
 @pytest.mark.parametrize('load', [Load(0.5, 1.5, 2), Load(0.01, 0.1, 2), None])
-def test_a_flight_behind_the_clock_is_excused_by_a_load_and_by_nothing_else(load):
+def test_flight_behind_clock_is_excused_by_load_alone(load):
     meter = SimpleNamespace(worst=lambda: load)
     expected = (pytest.raises(TooBusyError, match='^9 images lost: for 50% of the worst 2 s')
                 if load is not None and load.busy else nullcontext())
@@ -52,7 +52,7 @@ def test_a_flight_behind_the_clock_is_excused_by_a_load_and_by_nothing_else(load
     Simulator._blame(SimpleNamespace(_load=None), '9 images lost')  # end_if_busy is false
 
 
-def test_a_flight_that_the_bridge_ends_is_over_once_landed_and_its_log_has_time_and_reason():
+def test_flight_ended_by_bridge_is_over_once_landed_and_logged():
     follower, log = SimpleNamespace(armed=True, motion=SimpleNamespace(times=[])), Mock()
     node = SimpleNamespace(
         _vehicle=Mock(spec=ExternalVehicle), _early=None, _duration=60.0, _ahead=None, _log=log,
@@ -71,7 +71,7 @@ def test_a_flight_that_the_bridge_ends_is_over_once_landed_and_its_log_has_time_
         110.0, 113.0, 60.0, 'TAKEN_OVER: the pilot took over')
 
 
-def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_ends_it(
+def test_simulator_topics_share_stamps_and_ctrl_c_ends_it(
         ros, tmp_path):
     ear, executor = rclpy.create_node('ear'), SingleThreadedExecutor()
     executor.add_node(ear)

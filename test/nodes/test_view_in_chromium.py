@@ -273,7 +273,7 @@ def test_a_wrong_token_and_another_origin_are_refused(
     assert browser.value(SOCKET.format(f'ws://{address}/ws')) == 'refused'
 
 
-def test_a_page_is_old_when_its_node_is_killed_and_alive_when_it_is_back(
+def test_page_is_stale_when_node_is_killed_alive_when_back(
         browser: Browser, flight: Flight, tmp_path: Path) -> None:
     view = ViewProcess(control=False)
     browser.open(view.url)

@@ -137,7 +137,7 @@ def test_the_messages_of_a_flight_are_on_the_page(rig: Rig) -> None:
     assert {'follower', 'leader', 'command'} <= {shape['n'] for shape in page['scene']}
 
 
-def test_a_message_that_is_invalid_or_too_large_is_counted_and_the_node_goes_on(rig: Rig) -> None:
+def test_invalid_or_large_message_is_counted_node_goes_on(rig: Rig) -> None:
     rig.show()
     rig.place('odom', 'base_link', (np.nan, 0.0, 0.0))
     rig.give('planner/state', String(data='x' * 100_000))
@@ -211,7 +211,7 @@ def test_names_and_mounting_are_those_of_relative_pose(rig: Rig) -> None:
 
 @pytest.mark.parametrize(('button', 'request_type', 'wanted'), [
     ('brake', SetBool, SetBool.Request(data=False)), ('land', Trigger, Trigger.Request())])
-def test_each_press_of_a_button_calls_its_service_and_shows_the_answer(
+def test_each_button_press_calls_service_and_shows_answer(
         rig: Rig, button: str, request_type: Any, wanted: Any) -> None:
     client = rig.node._callers[button]
     assert client.srv_type is request_type
@@ -235,7 +235,7 @@ def test_a_button_without_its_node_is_answered(rig: Rig) -> None:
     assert rig.pages.answers == [('land', False, 'no answer of mavlink_bridge/land')]
 
 
-def test_without_control_the_node_has_no_client_but_for_parameters(ros: None) -> None:
+def test_node_without_control_has_parameter_clients_only(ros: None) -> None:
     made = Rig()
     assert {client.srv_name.rpartition('/')[2] for client in made.node.clients} == {
         'list_parameters', 'get_parameters'}

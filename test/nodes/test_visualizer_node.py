@@ -90,7 +90,7 @@ def points(marker: Marker) -> Any:
     return np.array([[p.x, p.y, p.z] for p in marker.points])
 
 
-def test_it_draws_each_vehicle_where_it_is_and_the_band_of_the_one_in_the_graph(rig: Rig) -> None:
+def test_vehicles_are_drawn_in_place_with_band_of_followed_one(rig: Rig) -> None:
     drawn = rig.draw()
     assert set(drawn) == {
         'follower', 'state', 'command', 'leader', 'leader name', 'leader velocity',
@@ -122,7 +122,7 @@ def test_the_bound_that_the_guard_holds_is_thick(
     assert drawn['state'].text == f'HOLD\nguard: {limits.split(", ")[-1]}\nwhy'
 
 
-def test_old_states_are_marked_and_forgotten_and_nothing_is_drawn_without_a_viewer(
+def test_old_states_are_marked_drawn_only_for_a_viewer(
         rig: Rig) -> None:
     drawn = rig.draw(age=1.0)
     assert drawn['leader name'].text == 'leader, not seen for 1.0 s' and 'command' not in drawn

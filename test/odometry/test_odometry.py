@@ -65,7 +65,7 @@ def test_between_samples_a_steady_flight_is_exact(stamp: float) -> None:
     assert yaw_from_quaternion(found.quaternion) == pytest.approx(RATE * stamp)
 
 
-def test_attitude_takes_the_shorter_arc_whatever_the_quaternions_sign() -> None:
+def test_attitude_takes_shorter_arc_for_either_sign() -> None:
     buffer = OdometryBuffer()
     a, b = quaternion_from_rpy(0.1, 0.0, 3.1), -quaternion_from_rpy(0.1, 0.0, -3.1)
     for stamp, q in ((0.0, a), (0.02, b)):
@@ -177,7 +177,7 @@ def rms(values: list[float]) -> float:
     (0.0004, 0.0, 1.0, 0.45), (0.00524, 0.0, 1.0, 0.45),
     (0.00524, 0.005, 1.0, 0.6),  # noise above the effect of a lag
     (0.0004, 0.01, 1.0, 1.1), *((0.0004, 0.0, share, 1.1) for share in (0.0, -1.0, 10.0))])
-def test_white_noise_is_steadied_and_wrong_rates_do_not_drag_the_attitude(
+def test_white_noise_is_smoothed_wrong_rates_do_not_turn_it(
         noise: float, lag: float, share: float, most: float) -> None:
     raw, steadied = turning(noise, lag, share)
     assert rms(steadied) < most * rms(raw)

@@ -63,7 +63,7 @@ def test_the_frame_of_the_velocity_is_found_and_kept(
     assert ('angular velocity' in source.missing) == (truth['angular_rates'] == 'zeros')
 
 
-def test_the_velocity_from_the_positions_is_near_that_of_the_messages() -> None:
+def test_velocity_from_positions_is_near_that_of_messages() -> None:
     derived, sent, off = source_of(FLIGHT, NONE), source_of(FLIGHT, ODOM), []
     for arrival, message in recorded(FLIGHT).odometry:
         one, other = derived.take(message, arrival), sent.take(message, arrival)
@@ -73,7 +73,7 @@ def test_the_velocity_from_the_positions_is_near_that_of_the_messages() -> None:
     assert np.sqrt(np.mean(np.sum(np.array(off[20:])**2, axis=1))) < 0.11
 
 
-def test_tags_on_walls_seen_in_flight_come_out_at_rest_though_images_are_stamped_late() -> None:
+def test_wall_tags_are_at_rest_though_images_are_stamped_late() -> None:
     offset = TimeOffset()
     found = seen_tags(recorded(FLIGHT), source_of(FLIGHT).take, time_offset=offset, shift=0.05)
     assert offset.estimate == pytest.approx(0.004 - 0.05, abs=0.003)
@@ -83,7 +83,7 @@ def test_tags_on_walls_seen_in_flight_come_out_at_rest_though_images_are_stamped
     assert scatter(found) < 0.08  # its odometry corrects itself by 29 cm meanwhile
 
 
-def test_the_tag_of_the_walk_is_at_rest_once_its_stamps_are_those_of_the_odometry() -> None:
+def test_tag_of_walk_is_at_rest_with_odometry_stamps() -> None:
     recording = Recording(WALK)
     recording.tags = [tag._replace(stamp=tag.stamp - round(LATE * 1e9)) for tag in recording.tags]
     found = seen_tags(recording, source_of(WALK).take)

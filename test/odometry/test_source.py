@@ -129,7 +129,7 @@ def test_until_the_readings_differ_nothing_is_decided(reported: float) -> None:
     assert derived[20:] == [reported == 0.0] * 980
 
 
-def test_it_starts_from_the_child_frame_where_the_reading_does_not_matter() -> None:
+def test_it_starts_from_child_frame_if_reading_does_not_matter() -> None:
     source = OdometrySource()
     _, states = first_second(Source(), 0.0, 100.0, 0.1)
     assert not any(state.derived for _, state in states[1:])
@@ -166,7 +166,7 @@ def test_no_finding_makes_a_step_in_velocity(twist: str) -> None:
     assert np.abs(np.diff(velocities[50:], axis=0)).max() < 0.04
 
 
-def test_a_velocity_that_is_contradicted_is_dropped_and_believed_again() -> None:
+def test_contradicted_velocity_is_dropped_and_trusted_again() -> None:
     """In another frame for 4 s, then as before: what it is now counts."""
     source = OdometrySource()
     wrong = Source(twist='odom')
@@ -223,7 +223,7 @@ def test_a_jump_of_the_position_is_survived_and_told() -> None:
     assert [reason for reason, _ in source.new_events()] == ['odom jumped']
 
 
-def test_a_velocity_whose_variance_says_that_it_is_none_is_not_used() -> None:
+def test_velocity_with_absurd_variance_is_not_used() -> None:
     source = OdometrySource(SourceParams(twist_frame='child'))
     read(source, Source(), 3.0)
     for k in range(300, 310):  # as rtabmap does after it was lost

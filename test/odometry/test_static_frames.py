@@ -44,7 +44,7 @@ def test_a_frame_is_found_up_down_and_across_the_tree() -> None:
         np.testing.assert_allclose(pose.apply(point), expected.apply(point), atol=1e-12)
 
 
-def test_frames_that_are_not_connected_are_not_guessed_and_a_circle_ends() -> None:
+def test_unconnected_frames_are_not_guessed_circle_ends() -> None:
     frames = tree()
     for parent, child in (('world', 'elsewhere'), ('a', 'b'), ('b', 'a')):
         frames.add(parent, child, A)

@@ -85,7 +85,7 @@ def test_readings_that_hardly_differ_decide_nothing() -> None:
     assert watched.found == ''
 
 
-def test_a_velocity_that_is_no_such_thing_is_dropped_in_spite_of_steps() -> None:
+def test_velocity_that_is_none_is_dropped_despite_steps() -> None:
     watched = TwistFrame()
     for k in range(200):
         t = k / RATE
@@ -122,7 +122,7 @@ def test_evidence_against_a_velocity_expires_within_5_s(after: float) -> None:
     assert after == 0.0 or found[8] == CHILD  # as fast as it was lost
 
 
-def test_a_source_without_velocity_is_not_believed_where_nothing_moves() -> None:
+def test_source_without_velocity_is_unused_where_all_is_still() -> None:
     watched = TwistFrame()
     for k in range(2000):
         t = k / RATE

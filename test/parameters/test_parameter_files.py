@@ -38,7 +38,7 @@ def of(node: str, **values: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize('section', ['planner', '/planner', '/drone1/planner', '/**/planner'])
-def test_a_section_sets_its_parameters_and_the_others_have_their_defaults(section: str) -> None:
+def test_section_sets_its_parameters_others_have_defaults(section: str) -> None:
     values = parse_parameters(of(section, v_max=1, use_sim_time=True, qos_overrides={
         '/odom': {'depth': 5}}), TABLE)
     assert values['planner']['v_max'] == 1.0 and values['planner']['a_max'] == 2.5
@@ -46,7 +46,7 @@ def test_a_section_sets_its_parameters_and_the_others_have_their_defaults(sectio
     assert values['relative_pose']['camera_position'] == [0.1, 0.0, 0.0]
 
 
-def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
+def test_common_file_holds_defaults_and_names_they_know() -> None:
     path = resource('config/follower.yaml')
     sections = yaml.safe_load(path.read_text())
     assert list(sections) == ['/**', *(f'/**/{node}' for node in TABLE)]
@@ -108,7 +108,7 @@ def test_a_file_that_is_no_yaml_is_named_in_one_line(tmp_path: Path) -> None:
         assert len(str(error.value).splitlines()) == 1
 
 
-def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -> None:
+def test_command_line_files_are_those_of_ros_args() -> None:
     assert files_in(['planner', '--params-file', 'no.yaml', '--ros-args', '-p', 'v_max:=1.0',
                      '--params-file', 'a.yaml', '--', '--params-file', 'no.yaml', '--ros-args',
                      '--params-file', 'b.yaml']) == ['a.yaml', 'b.yaml']
@@ -146,7 +146,7 @@ def test_a_file_that_means_another_node_is_reported(
     assert reported.replace(f'{path}: ', '') == said
 
 
-def test_the_planner_reads_who_flies_along_from_the_neighbors_file(tmp_path: Path) -> None:
+def test_planner_reads_flock_members_from_neighbors_file(tmp_path: Path) -> None:
     document = yaml.safe_load(resource('config/neighbors.yaml').read_text())
     (leader,) = document['neighbors']
     document['neighbors'] += [{**leader, 'name': 'tower', 'marker_id': 1, 'role': 'avoid',
@@ -165,6 +165,6 @@ def test_the_planner_reads_who_flies_along_from_the_neighbors_file(tmp_path: Pat
         planner_params({**values, 'neighbors_file': '/nowhere.yaml'})
 
 
-def test_planner_and_neighbors_file_know_the_same_roles_and_radii() -> None:
+def test_planner_and_neighbors_file_know_same_roles_and_radii() -> None:
     assert (neighbors_file.ROLES, neighbors_file.RADII) == (ROLES, RADIUS)
     assert neighbors_file.MarkedNeighbor('x', ()).role == Member().role

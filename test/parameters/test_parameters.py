@@ -83,7 +83,7 @@ def make_node(ros):
         context.try_shutdown()
 
 
-def test_a_live_change_is_applied_and_a_refused_one_changes_nothing(make_node):
+def test_live_change_is_applied_and_refused_one_changes_nothing(make_node):
     from rclpy.parameter import Parameter
     node, table = make_node('-p', 'a_max:=3')
     assert table.current == (3.0, 1.0, 2.0)

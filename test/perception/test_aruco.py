@@ -73,6 +73,6 @@ def test_detected_corners_have_no_bias_inwards(turn: float) -> None:
     assert abs(np.mean(outside)) < 0.2
 
 
-def test_each_dictionary_of_opencv_is_known_by_its_size_without_opencv():
+def test_each_opencv_dictionary_is_known_by_size_without_opencv():
     for dictionary in aruco.dictionary_names():
         assert DICTIONARY_SIZES[dictionary] == aruco.dictionary_size(dictionary)

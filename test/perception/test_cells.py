@@ -67,7 +67,7 @@ def with_flipped(cells: Any, *inner: int) -> Any:
 
 
 @pytest.mark.parametrize('marker_id', range(50))
-def test_turned_mirrored_and_inverted_markers_do_not_show_the_code(marker_id: int) -> None:
+def test_turned_mirrored_inverted_markers_do_not_show_code(marker_id: int) -> None:
     cells, code = aruco.marker_code(DICTIONARY, marker_id), code_of(marker_id)
     assert shown(cells, code)
     for quarters in (1, 2, 3):
@@ -93,7 +93,7 @@ def test_as_many_cells_as_can_be_corrected_may_be_wrong(dictionary: str) -> None
         assert not shown(with_flipped(cells, *flipped[:max(code.errors + 1 >> 1, 1)]), code)
 
 
-def test_a_mirrored_print_is_not_found_though_few_of_its_cells_differ() -> None:
+def test_mirrored_print_is_not_found_though_few_cells_differ() -> None:
     cells, code = aruco.marker_code('DICT_5X5_100', 25), code_of(25, 'DICT_5X5_100')
     alike = min((np.rot90(np.fliplr(cells), k) for k in range(4)), key=lambda c: (c ^ cells).sum())
     assert np.count_nonzero(alike ^ cells) == 2 < code.errors
@@ -130,7 +130,7 @@ def test_contrast_must_be_enough_and_the_border_black() -> None:
 
 @pytest.mark.parametrize(('white', 'hidden', 'is_shown'), [
     (200, 2, True), (200, 3, False), (255, 2, False)])
-def test_a_reflex_may_hide_some_cells_unless_paper_is_saturated_as_well(
+def test_reflex_may_hide_cells_unless_paper_is_saturated(
         white: int, hidden: int, is_shown: bool) -> None:
     code, cells = code_of(5), aruco.marker_code(DICTIONARY, 5)
     image = picture(cells, white=white)
@@ -161,7 +161,7 @@ def test_the_edge_of_a_shadow_does_not_hide_the_code(dictionary: str, light: flo
 
 @pytest.mark.parametrize('count', [18, pytest.param(60, marks=pytest.mark.sweep)])
 @pytest.mark.parametrize('dictionary', DICTIONARIES)
-def test_no_other_marker_shows_the_code_in_even_light_or_in_shade(
+def test_no_other_marker_shows_code_in_even_light_or_shade(
         dictionary: str, count: int) -> None:
     rng, code = np.random.default_rng(13), code_of(3, dictionary)
     for marker_id in range(min(aruco.dictionary_size(dictionary), count)):

@@ -94,7 +94,7 @@ def near(track: NeighborFilter, place: Array) -> bool:
         np.linalg.norm(track.newest.position - place)) < 0.06
 
 
-def test_of_two_at_once_the_first_taken_in_is_believed_and_both_are_tracked() -> None:
+def test_first_of_two_is_trusted_and_both_are_tracked() -> None:
     course = Course(np.zeros(3))
     course.watch(1.0, WALL)
     assert course.candidate.beside and course.candidate.confirmed
@@ -114,7 +114,7 @@ def test_a_false_detection_is_not_a_duplicate_and_forgotten() -> None:
 
 @pytest.mark.parametrize('velocity', [VELOCITY, np.zeros(3)], ids=['moving', 'hovering'])
 @pytest.mark.parametrize('known', [True, False])
-def test_a_print_is_never_the_leader_that_was_beside_it_and_hardly_one_too_far_off(
+def test_print_is_never_the_leader_beside_it_rarely_one_far_off(
         velocity: Array, known: bool) -> None:
     course = Course(velocity)
     course.watch(3.0, *[WALL] * known)
@@ -125,13 +125,13 @@ def test_a_print_is_never_the_leader_that_was_beside_it_and_hardly_one_too_far_o
     assert near(course.tracks.primary, course.leader)
 
 
-def test_what_was_beside_it_is_not_taken_for_it_however_long_it_is_gone() -> None:
+def test_print_beside_leader_is_never_taken_for_it() -> None:
     course = Course()
     course.watch(2.0, WALL)
     assert UpdateOutcome.STARTED not in outcomes(course.only(3.0 * PATIENCE, WALL))
 
 
-def test_what_appeared_elsewhere_is_believed_after_patience_or_once_it_moves() -> None:
+def test_one_elsewhere_is_trusted_after_time_or_motion() -> None:
     still, moving = Course(), Course()
     for course in still, moving:
         course.watch(2.0)
@@ -154,7 +154,7 @@ def test_a_restart_that_needs_more_than_its_speed_is_refused(speed: float) -> No
     assert outcomes(course.only(2.0, far)) == {UpdateOutcome.OUTLIER}
 
 
-def test_within_reach_the_track_refused_takes_over_after_six_with_its_velocity() -> None:
+def test_refused_track_takes_over_after_six_with_velocity() -> None:
     course = Course()
     course.watch(2.0)
     fast = VELOCITY + np.array([0.0, 1.5, 0.0])
@@ -178,7 +178,7 @@ def test_one_that_moves_takes_the_place_of_one_that_never_did() -> None:
 
 
 @pytest.mark.parametrize('unseen', [1.2, 2.5])
-def test_a_print_first_seen_within_reach_gives_way_to_the_leader_that_comes_back(
+def test_print_seen_within_reach_yields_to_returning_leader(
         unseen: float) -> None:
     course = Course(np.zeros(3))
     course.watch(2.0)
@@ -201,7 +201,7 @@ def test_two_that_move_do_not_change_places() -> None:
         assert near(course.tracks.primary, course.leader)
 
 
-def test_a_print_seen_in_turns_with_the_leader_does_not_take_its_place() -> None:
+def test_print_seen_in_turns_with_leader_does_not_replace_it() -> None:
     course = Course(np.zeros(3))
     course.watch(2.0)
     for _ in range(30):

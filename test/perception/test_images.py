@@ -175,7 +175,7 @@ def decoded_in_bounds(encoding: str, height: int, width: int, step: int, bigendi
 
 @given(encoding=st.sampled_from(ENCODINGS) | st.text(), height=SIZES, width=SIZES,
        step=SIZES | st.integers(40, 200), bigendian=st.booleans(), length=st.integers(0, 4000))
-def test_whatever_a_message_claims_is_an_image_of_that_size_or_a_value_error(
+def test_any_message_is_image_of_its_size_or_value_error(
         encoding: str, height: int, width: int, step: int, bigendian: bool, length: int) -> None:
     try:
         gray = decoded_in_bounds(encoding, height, width, step, bigendian, length)

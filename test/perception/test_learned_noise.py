@@ -56,7 +56,7 @@ def covariance(attitude: float, distance: float) -> Array:
 
 @pytest.mark.parametrize(('attitude', 'distance'), [
     (0.002, 0.0), (0.02, 0.0), (0.0, 0.004), (0.0, 0.02)])
-def test_noise_is_learned_of_the_attitude_across_the_line_of_sight_and_of_the_distance_along_it(
+def test_noise_is_learned_across_sight_and_along_distance(
         attitude: float, distance: float) -> None:
     learned = fed(attitude, distance)
     assert learned.attitude == pytest.approx(attitude, rel=0.25, abs=0.0007)
@@ -65,7 +65,7 @@ def test_noise_is_learned_of_the_attitude_across_the_line_of_sight_and_of_the_di
 
 @pytest.mark.parametrize(('white', 'shares'), [
     (0.8, [0.8, 0.8]), (0.1, [LEAST_SHARE, LEAST_SHARE]), (2.0, [1.0, 1.0])])
-def test_the_share_of_a_poses_variance_that_is_noise_is_learned_down_to_a_limit(
+def test_noise_share_of_pose_variance_is_learned_to_a_limit(
         white: float, shares: list[float]) -> None:
     learned, rng = LearnedNoise(1e-6), np.random.default_rng(3)
     seen = []
@@ -80,7 +80,7 @@ def test_the_share_of_a_poses_variance_that_is_noise_is_learned_down_to_a_limit(
     assert learned.shares == [1.0, 1.0]
 
 
-def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
+def test_attitude_moves_sideways_and_tilts_together() -> None:
     noise = fed(0.005, 0.0)
     added = noise.covariance(SIGHT)
     assert ALONG @ added[:3, :3] @ ALONG < 1e-6
@@ -145,7 +145,7 @@ def test_a_neighbor_unseen_may_do_more_than_it_did() -> None:
     assert learned.scale(1.0) == [1.0] * 3
 
 
-def test_a_track_that_begins_anew_does_not_keep_the_motion_that_was_learned() -> None:
+def test_new_track_does_not_keep_learned_motion() -> None:
     tracker, rng = NeighborFilter(), np.random.default_rng(5)
     noise = np.diag([0.001] * 3 + [0.01] * 3)**2
     for k in range(300):

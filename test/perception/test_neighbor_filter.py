@@ -179,7 +179,7 @@ def surprising(off: float) -> tuple[NeighborFilter, float, Array]:
     return tracker, t, way
 
 
-def test_a_second_surprise_to_the_same_side_is_believed_and_one_to_the_other_is_not() -> None:
+def test_second_surprise_counts_on_same_side_only() -> None:
     shares = []
     for side in (1.0, -1.0):
         tracker, t, way = surprising(4.0)
@@ -207,7 +207,7 @@ def test_a_mirrored_attitude_leaves_the_position_usable() -> None:
     assert np.linalg.norm(e[6:9]) < 0.05
 
 
-def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
+def test_track_begun_mirrored_turns_and_keeps_velocity() -> None:
     tracker = NeighborFilter()
     times = DT * np.arange(66)
     for t in times[:60]:
@@ -221,7 +221,7 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
 
 
 @pytest.mark.parametrize(('modeled', 'least', 'most'), [(True, 2.0, 4.0), (False, 5.0, 10.0)])
-def test_errors_that_are_alike_from_image_to_image_do_not_average_out(
+def test_errors_alike_between_images_do_not_average_out(
         modeled: bool, least: float, most: float) -> None:
     alike, squares = 0.8 * NOISE, []
     for seed in range(16):
@@ -268,7 +268,7 @@ def test_a_contradicted_attitude_is_dropped_within_0_3_s(rate: float, images: in
 @pytest.mark.parametrize(('t', 'outcome'), [
     (1.9, UpdateOutcome.LATE), (2.0, UpdateOutcome.LATE), (3.0, UpdateOutcome.USED),
     (4.5, UpdateOutcome.STARTED), (0.1, UpdateOutcome.STARTED)])  # a gap; a jump back in time
-def test_late_and_repeated_frames_are_dropped_and_jumps_start_anew(
+def test_late_and_repeated_frames_are_dropped_jumps_restart(
         t: float, outcome: UpdateOutcome) -> None:
     tracker = tracked(2.0)
     before = now(tracker, 2.0)

@@ -69,7 +69,7 @@ def test_a_neighbor_may_carry_several_markers() -> None:
         assert config.by_marker()[k] == (leader, marker)
 
 
-def test_a_neighbor_has_a_role_a_radius_and_an_antenna_where_they_are_given() -> None:
+def test_neighbor_has_role_radius_and_antenna_as_given() -> None:
     (plain,) = parse(document()).neighbors
     assert (plain.role, plain.radius, plain.tag_position) == ('leader', 0.0, (0.0, 0.0, 0.0))
     for written in document, lambda **changes: several(marker_entry(0), **changes):

@@ -86,7 +86,7 @@ class Flight:
 
 
 @pytest.mark.parametrize(('light', 'gamma'), [(0.1, 2.2), (0.3, 1.0)])
-def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
+def test_hard_shadow_edge_across_marker_costs_nothing(light: float,
                                                                    gamma: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
         shade = 0.07 * k + 1.0, 0.55 * np.sin(k / 7.0), light
@@ -107,7 +107,7 @@ def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) 
 
 
 @pytest.mark.parametrize('cells', [0.5, 1.5])
-def test_motion_that_smears_the_marker_over_cells_leaves_it_tracked(cells: float) -> None:
+def test_smear_over_cells_leaves_marker_tracked(cells: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
         return world.image(along(pose, cells, 0.15 * k, world), k)
 

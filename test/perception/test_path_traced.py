@@ -49,7 +49,7 @@ def smeared(image: Array, length: float, direction: float) -> Array:
 
 
 @pytest.mark.parametrize(('cells', 'direction'), [(0.0, 0.0), (0.8, 0.7)])
-def test_a_smeared_first_image_does_not_lock_the_mirrored_attitude(
+def test_smeared_first_image_does_not_lock_mirrored_attitude(
         cells: float, direction: float) -> None:
     motion_of = load_module(DATA / 'traj.py')
     flight = motion_of.flight('room_hd')

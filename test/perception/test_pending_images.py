@@ -88,7 +88,7 @@ def test_an_image_waits_until_odometry_has_reached_its_stamp() -> None:
                                atol=0.02)
 
 
-def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time() -> None:
+def test_image_without_odometry_is_extrapolated_or_dropped() -> None:
     queue = Queue()
     queue.odometry(0.0)
     queue.image(0.025)
@@ -99,7 +99,7 @@ def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time()
     assert not far.usable
 
 
-def test_images_wait_little_longer_than_odometry_was_late_of_late() -> None:
+def test_images_wait_little_longer_than_recent_odometry_delay() -> None:
     queue = Queue()
     for k in range(N_OBSERVED):
         stamp = 0.01 * k
@@ -114,7 +114,7 @@ def test_images_wait_little_longer_than_odometry_was_late_of_late() -> None:
         assert not one.usable
 
 
-def test_an_image_from_the_future_holds_nobody_up_and_the_oldest_is_dropped_first() -> None:
+def test_image_from_future_delays_none_oldest_is_dropped() -> None:
     queue = Queue()
     queue.odometry(0.0, 0.02)
     queue.image(5.0)
@@ -124,7 +124,7 @@ def test_an_image_from_the_future_holds_nobody_up_and_the_oldest_is_dropped_firs
         [False] * (MOST_PENDING - 1) + [True])
 
 
-def test_an_image_waits_for_a_usable_calibration_and_then_is_dropped_with_the_reason() -> None:
+def test_image_waits_for_calibration_then_is_dropped_with_reason() -> None:
     queue = Queue(calibrated=False)
     queue.odometry(0.0)
     queue.image(0.0)

@@ -130,7 +130,7 @@ def test_a_tracked_neighbor_is_where_it_is(model: str, distance: float) -> None:
 
 
 @pytest.mark.parametrize('cells', [(2.2, 0.0), (-1.5, 2.0), (0.0, -2.4)])
-def test_a_marker_that_moved_cells_farther_than_expected_is_tracked(
+def test_marker_moved_cells_beyond_expectation_is_tracked(
         cells: tuple[float, float]) -> None:
     marker = facing((0.02, -0.01, 1.5), (0.1, 0.3, 0.1))
     step = SIDE / 6.0 * (cells[0] * marker.rotation[:, 0] + cells[1] * marker.rotation[:, 1])
@@ -221,7 +221,7 @@ def test_a_print_whose_edges_run_together_is_fitted_whole(cells: float, blurred:
     assert np.linalg.norm(error(found, body(marker))[3:]) < 0.05
 
 
-def test_clear_edges_whose_code_is_hidden_are_not_taken_for_a_smear(
+def test_clear_edges_with_hidden_code_do_not_count_as_smear(
         monkeypatch: pytest.MonkeyPatch) -> None:
     marker = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05))
     image, corners = render(SMALL, {0: marker}), corners_of(SMALL, marker)
@@ -239,7 +239,7 @@ def test_clear_edges_whose_code_is_hidden_are_not_taken_for_a_smear(
     assert locate(image, SMALL, LEADER, 0, corners, PosePrior(body(marker))) is None
 
 
-def test_where_both_attitudes_are_probable_the_covariance_covers_both() -> None:
+def test_covariance_covers_both_probable_attitudes() -> None:
     wider, values = [], []
     for seed in range(6):
         marker = facing((0.0, 0.0, 4.0), (0.0, 0.1, 0.0))
@@ -282,7 +282,7 @@ def test_from_coarse_corners_the_edges_are_found(model: str) -> None:
 
 
 @pytest.mark.parametrize('blur', [0.6, 7.0])
-def test_a_detected_marker_must_show_the_code_by_its_edges_or_smeared(blur: float) -> None:
+def test_detected_marker_must_show_its_code_sharp_or_smeared(blur: float) -> None:
     marker = facing((0.0, 0.0, 1.3), (0.1, 0.4, 0.1))
     corners = corners_of(SMALL, marker)
     found = known(locate(render(SMALL, {0: marker}, blur=blur), SMALL, LEADER, 0, corners,

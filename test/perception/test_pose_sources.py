@@ -118,7 +118,7 @@ def test_outliers_and_gaps_leave_the_track_near_the_neighbor() -> None:
     assert len(far) > 140 and max(far) < 0.3
 
 
-def test_position_only_keeps_the_velocity_certain_and_the_attitude_unknown() -> None:
+def test_position_only_has_certain_velocity_unknown_attitude() -> None:
     perceiver = started(config(position_only=True))
     *_, (t, state) = fly(perceiver, duration=4.0)
     assert np.linalg.norm(state.position - leader_pose(t).translation) < 0.05
@@ -147,7 +147,7 @@ def test_a_bad_pose_is_refused_by_its_reason(changes: dict[str, Any], reason: st
     assert not [*perceiver.sources.due(0.0)]
 
 
-def test_a_repeated_stamp_and_a_pose_without_odometry_are_refused() -> None:
+def test_repeated_stamp_and_pose_without_odometry_are_refused() -> None:
     perceiver = started()
     assert perceiver.take_pose('leader', pose(0.5), 0.0) == (pose_sources.UNPLACED, 'leader')
     seconds(perceiver, 0.0, 1.0)
@@ -184,7 +184,7 @@ def test_frames_follow_the_poses_of_their_images() -> None:
     assert due(0.67) == [] and due(0.69) == stamps[2:3]
 
 
-def test_a_frame_after_its_pose_teaches_that_no_later_frame_has_to_wait() -> None:
+def test_frame_after_its_pose_teaches_later_ones_not_to_wait() -> None:
     neighbors = parse({'frames_topic': '/info', 'neighbors': [
         {'name': 'leader', 'pose_topic': '/poses'}]})
     perceiver = started(neighbors)
@@ -219,7 +219,7 @@ def test_a_wrong_source_is_refused(entry: dict[str, Any], message: str) -> None:
     assert message in str(caught.value)
 
 
-def test_a_source_needs_no_dictionary_and_a_marker_beside_it_does() -> None:
+def test_source_needs_no_dictionary_marker_beside_it_does() -> None:
     tf = {'name': 'a', 'tf_frame': 'x', 'position_std': 0.1, 'position_only': True}
     assert parse({'neighbors': [tf]}).neighbors[0].source == PoseSource(
         tf_frame='x', position_std=0.1, position_only=True)

@@ -38,7 +38,7 @@ AGAIN = 25.0 / RANGE_GATE  # factor for a deviation of 5
     (6, [-5.0, -5.0], [(1, AGAIN), (AGAIN, 1)]),
     (3, [WILD, WILD, WILD], [None, None, (1.01**2 * RANGE_WILD, 1)]),
     (2, [np.nan, np.inf, -np.inf, 0.0, 1.0], [None, None, None, (1, 1), (1, 1)])])
-def test_distances_outside_the_gate_are_refused_or_have_less_weight(
+def test_distances_outside_gate_are_refused_or_weigh_less(
         most: int, deviations: list[float],
         factors: list[tuple[float, float] | None]) -> None:
     gate = RangeGate(most)
@@ -73,7 +73,7 @@ def test_a_bias_that_jumps_is_followed() -> None:
     assert bias.value == pytest.approx(0.6, abs=0.05)
 
 
-def test_the_bias_becomes_uncertain_where_nothing_is_learned_and_never_more_than_unknown() -> None:
+def test_bias_grows_uncertain_unlearned_up_to_unknown() -> None:
     bias = learned(5, 0.1)
     variances = [bias.variance(20.0 + t) for t in (0.0, 5.0, 60.0, 1e6)]
     assert variances == sorted(variances)

@@ -107,7 +107,7 @@ def test_through_5_s_out_of_sight_the_distance_stays_known(seed: int) -> None:
     assert np.mean((errors / deviations) ** 2) < 4.0
 
 
-def test_across_the_line_of_sight_it_grows_uncertain_and_along_it_does_not() -> None:
+def test_distance_grows_uncertain_only_across_line_of_sight() -> None:
     rig = Rig()
     rig.fly(5.0, True)
     deviations = []
@@ -190,7 +190,7 @@ def test_a_distance_corrects_what_is_along_the_line_only() -> None:
     assert NeighborFilter().update_range(0.0, 2.0, np.zeros(3), 0.01) is UpdateOutcome.LOST
 
 
-def test_an_antenna_beside_the_body_counts_where_the_attitude_is_known() -> None:
+def test_antenna_beside_body_counts_if_attitude_is_known() -> None:
     tracker, tag = NeighborFilter(FilterParams()), np.array([-0.5, 0.0, 0.0])
     for k in range(60):
         tracker.update(k / 30, Transform(np.eye(3), np.array([2.0, 0.0, 0.0])), np.zeros(3), NOISE)

@@ -156,7 +156,7 @@ def assert_same(name: str, pose: Transform, other: Transform) -> None:
 
 @pytest.mark.parametrize('name', PHOTOGRAPHS)
 @pytest.mark.parametrize(('across', 'down'), [(30, 0), (0, 30), (30, 30), (45, -10)])
-def test_a_photograph_smeared_by_a_cell_and_more_shows_its_markers_where_they_are(
+def test_photograph_smeared_by_a_cell_shows_markers_in_place(
         name: str, across: int, down: int) -> None:
     scene = Scene(name)
     scene.look()

@@ -88,7 +88,7 @@ def pitching() -> list[tuple[float, GrayImage]]:
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_a_turning_drone_with_a_rolling_shutter_sees_a_leader_at_rest(
+def test_turning_drone_with_rolling_shutter_sees_still_leader(
         known: bool, pitching: list[tuple[float, GrayImage]]) -> None:
     """It pitches up and down at up to 0.5 rad/s; the leader and its own place are at rest."""
     camera = MountedCamera(MOUNTING, readout_time=READOUT if known else 0.0)

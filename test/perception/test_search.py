@@ -58,7 +58,7 @@ def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) 
 
 
 @pytest.mark.parametrize('hidden', [(20, 20, 18), (110, 110, 20), (65, 20, 15)])
-def test_an_outline_is_whole_although_a_reflex_hides_a_corner_or_part_of_a_side(
+def test_outline_is_whole_though_reflex_hides_corner_or_side(
         hidden: tuple[int, int, int]) -> None:
     image = np.full((140, 150), 190, dtype=np.uint8)
     image[20:111, 20:111] = 30
@@ -83,7 +83,7 @@ def test_what_is_expected_outside_the_image_is_not_searched_for(
 
 @pytest.mark.parametrize(('place', 'outwards'), [
     ((-1.03, 0.0), (-1.0, 0.0)), ((0.0, -0.72), (0.0, -1.0)), ((0.93, 0.7), (1.0, 1.0))])
-def test_at_the_rim_of_the_image_what_is_left_of_the_region_is_searched(
+def test_remaining_region_at_image_rim_is_searched(
         place: tuple[float, float], outwards: tuple[float, float]) -> None:
     # The marker is just inside, its expected place 25 px further out.
     inside = facing((*place, 2.1), (0.0, 0.1, 0.0))

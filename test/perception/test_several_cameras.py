@@ -103,7 +103,7 @@ def rendered(pose: Transform | None, seed: int) -> GrayImage:
 
 
 @pytest.mark.parametrize('later', [0.0, 0.023], ids=['at once', 'in turns'])
-def test_a_neighbor_passes_from_one_image_to_the_next_without_a_gap_or_a_step(
+def test_neighbor_passes_between_images_without_gap_or_step(
         later: float) -> None:
     # Above, and seen aslant: both attitudes of a marker that is seen straight on look the same.
     drone, start = Drone(front=FRONT, left=LEFT), Transform.from_quaternion(
@@ -142,7 +142,7 @@ def watched(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int
     return calls
 
 
-def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
+def test_tracked_neighbor_is_not_searched_where_unexpected(
         monkeypatch: pytest.MonkeyPatch) -> None:
     drone = Drone(front=FRONT, back=BACK)
     drone.see('front', 0.0, ahead(2.0, 0.0))
@@ -155,7 +155,7 @@ def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
     assert (len(tracked), len(whole)) == (18, 0)  # in the images of the front camera
 
 
-def test_a_neighbor_covered_in_one_image_is_looked_for_there_now_and_then(
+def test_neighbor_covered_once_is_searched_there_now_and_then(
         monkeypatch: pytest.MonkeyPatch) -> None:
     drone, tracked = Drone(front=FRONT, left=LEFT), watched(monkeypatch, tracker_module, 'track')
     for k in range(50):
@@ -180,7 +180,7 @@ def test_more_cameras_search_no_more_whole_images(monkeypatch: pytest.MonkeyPatc
     assert len(portions) == pytest.approx(2.0 / PORTION_PERIOD, abs=3)
 
 
-def test_a_neighbor_that_leaves_all_images_is_searched_for_in_all_and_found() -> None:
+def test_neighbor_that_leaves_all_images_is_searched_and_found() -> None:
     drone, found = Drone(front=FRONT, back=BACK), list[float]()
     for k in range(10):
         drone.see('front', 0.05 * k, ahead(2.0, 0.0, 0.05 * k))
@@ -192,7 +192,7 @@ def test_a_neighbor_that_leaves_all_images_is_searched_for_in_all_and_found() ->
     assert found and found[0] <= 3.0 + 4 * SEARCH_PERIOD + 0.05
 
 
-def test_each_camera_finds_its_own_offset_of_stamps_and_the_track_goes_with_it(
+def test_each_camera_finds_its_stamp_offset_track_follows(
         monkeypatch: pytest.MonkeyPatch) -> None:
     offsets, rng = {'front': 0.0, 'left': 0.02}, np.random.default_rng(3)
     drone, exposed = Drone(front=FRONT, left=LEFT), ['', 0.0]

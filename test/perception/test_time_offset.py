@@ -115,7 +115,7 @@ def test_one_who_does_not_turn_cannot_tell_and_says_so() -> None:
     assert found.deviation > 0.02
 
 
-def test_a_fixed_offset_is_not_altered_and_a_known_one_is_the_start() -> None:
+def test_fixed_offset_is_kept_and_known_one_is_the_start() -> None:
     found = TimeOffset(0.01, fixed=True)
     assert set(flown(0.02, 4.0, found)) == {0.01} and found.describe == '10.0 ms applied'
     known = TimeOffset(0.02)

@@ -104,7 +104,7 @@ def test_the_noise_of_the_own_state_widens_a_reported_state() -> None:
     np.testing.assert_allclose(np.diag(noisy)[:6], [1.0, 1.04, 1.04, 1.3, 1.3, 1.3])
 
 
-def test_a_leader_in_formation_has_the_own_velocity_through_jumps_of_odometry_and_time(
+def test_formation_leader_has_own_velocity_through_jumps(
         image: GrayImage) -> None:
     tracker = Tracker(CONFIG, MOUNTING)
     for k in range(360):
@@ -148,7 +148,7 @@ def test_the_cheapest_stage_that_finds_the_neighbor_is_used(image: GrayImage) ->
 
 @pytest.mark.parametrize(('period', 'stages'), [
     (1 / 30, ['roi', 'full', 'roi', 'full']), (0.2, ['full'] * 4)])
-def test_the_search_near_takes_turns_with_portions_unless_images_are_rare(
+def test_near_search_alternates_with_portions_unless_rare(
         image: GrayImage, period: float, stages: list[str]) -> None:
     drone = hovering(period=period)
     drone.see(image)
@@ -174,7 +174,7 @@ def test_whole_images_are_searched_in_portions_at_a_limited_rate(
     assert {stamps.count(stamp) for stamp in stamps[1:]} == {most}
 
 
-def test_a_track_that_is_lost_after_a_while_is_not_searched_for_in_all_portions_at_once(
+def test_lost_track_is_not_searched_in_all_portions_at_once(
         monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
     drone, searched = hovering(period=1.0 / 30.0), list[int]()
     portion = search.portion
@@ -190,7 +190,7 @@ def test_a_track_that_is_lost_after_a_while_is_not_searched_for_in_all_portions_
     assert searched[15:] == [0, 1] * 6
 
 
-def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
+def test_mirror_image_of_clear_attitude_is_checked_at_times(
         monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
     drone, done, track = hovering(), list[bool](), tracker_module.track
 
@@ -206,7 +206,7 @@ def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
     assert done == ([True] + [False] * (MIRRORED_EVERY - 1)) * 2 + [True]
 
 
-def test_a_detection_turns_a_track_round_that_only_smears_confirm(
+def test_detection_turns_track_that_only_smear_fits_confirm(
         monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
     drone, truth = hovering(), hovering().see(image).estimates['leader'].rotation
     locate, track = tracker_module.locate, tracker_module.track

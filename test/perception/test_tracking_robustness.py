@@ -100,7 +100,7 @@ def test_a_marker_covered_by_5_percent_on_one_side_stays_tracked(
 @pytest.mark.parametrize('conditions', [
     {'black': 2.0, 'white': 20.0}, {'black': 200.0, 'white': 1000.0},
     {'black': 60.0, 'white': 400.0, 'gamma': 2.2, 'blur': 1.5}, {'blur': 3.0}], ids=str)
-def test_in_bad_light_and_out_of_focus_no_fewer_markers_are_found_than_by_default(
+def test_bad_light_and_defocus_find_no_fewer_than_default(
         conditions: dict[str, float], default_finds: Callable[[GrayImage], bool]) -> None:
     found, by_default = shares([render(CAMERA, {0: course(k)}, rays=3, seed=k, **conditions)
                                 for k in range(26)], default_finds, 0.15)
@@ -217,7 +217,7 @@ def clutter(count: int, uneven: bool) -> Iterator[tuple[str, GrayImage]]:
 @pytest.mark.parametrize(('count', 'uneven'), [
     (36, False), *(pytest.param(*each, marks=pytest.mark.sweep) for each in (
         (120, False), (1000, True)))])
-def test_clutter_where_the_marker_was_a_moment_ago_is_never_taken_for_it(
+def test_clutter_at_last_place_of_marker_is_never_taken_for_it(
         count: int, uneven: bool) -> None:
     follower, marker_image = Hovering(CAMERA, MOUNTING), render(CAMERA, {0: HERE})
     for k, (kind, image) in enumerate(clutter(count, uneven)):

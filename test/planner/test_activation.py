@@ -196,7 +196,7 @@ def test_an_interruption_between_two_ticks_counts_too(interrupt: str) -> None:
     assert command.acceleration[:2] == pytest.approx(0.2 * whole.acceleration[:2], rel=0.01)
 
 
-def test_engaging_again_and_being_told_active_again_change_nothing() -> None:
+def test_repeated_engage_and_active_reports_change_nothing() -> None:
     flight, other = taken_off(), taken_off()
     for each in (flight, other):
         each.bridge('ACTIVE')

@@ -82,7 +82,7 @@ def heights(*args: Any, **options: Any) -> list[float]:
     return [height for _, height, _ in flown(*args, **options)]
 
 
-def test_a_climb_as_small_as_its_noise_is_none_and_a_real_one_counts() -> None:
+def test_climb_below_noise_counts_as_none_a_real_one_counts() -> None:
     params = replace(PARAMS, v_max=2.0)
     for climb, least, most in ((0.03, 0.0, 0.001), (-0.03, -0.001, 0.0), (0.2, 0.18, 0.201),
                                (-0.2, -0.201, -0.18), (0.7, 0.699, 0.701)):
@@ -103,7 +103,7 @@ def test_an_absurd_acceleration_of_the_leader_does_no_harm() -> None:
     assert abs(altitude.held - 2.0) <= 5 * PERIOD * PARAMS.climb_rate
 
 
-def test_after_a_loss_the_climb_begins_gently_and_does_not_overshoot() -> None:
+def test_climb_after_loss_begins_gently_without_overshoot() -> None:
     """The vehicle flies each command 0.2 s late, as flights do."""
     before = 0.0
     for altitude, height, speed in flown(6.0, lambda t: (3.0, 0.0), late=2):
@@ -125,7 +125,7 @@ def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
     assert (low.climb, high.climb) == pytest.approx((0.0, 0.0))
 
 
-def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
+def test_behind_climbing_leader_it_stops_at_altitude_max() -> None:
     params = replace(PARAMS, altitude_max=3.0)
     altitude = Altitude.begin(me(2.5), 0.0, params)
     for tick in range(60):
@@ -135,13 +135,13 @@ def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
         pytest.approx(3.0 - ALTITUDE_MARGIN), pytest.approx(0.0, abs=1e-3))
 
 
-def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
+def test_start_below_altitude_min_neither_jumps_nor_descends() -> None:
     altitude = Altitude.begin(me(0.6), 0.0, PARAMS)
     assert followed(altitude, leader(0.2), 10.0).held == 0.6
     assert followed(altitude, leader(1.8), 10.0).held == pytest.approx(1.8)
 
 
-def test_without_a_known_ground_it_does_not_go_below_where_it_began() -> None:
+def test_unknown_ground_limits_it_to_its_starting_height() -> None:
     altitude = Altitude.begin(me(3.0), None, PARAMS)
     assert followed(altitude, leader(1.0), 10.0).held == 3.0
 
@@ -161,7 +161,7 @@ def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held
     (-math.inf, math.inf, -math.inf, 3.0), (-math.inf, math.inf, 4.0, 4.0),
     (-math.inf, -0.1, -math.inf, math.nan), (0.45, math.inf, -math.inf, math.nan),
     (-0.1, 1.6, -math.inf, 3.0)])
-def test_the_commanded_altitude_is_unknown_while_neighbors_limit_the_climb(
+def test_commanded_altitude_is_unknown_while_climb_is_limited(
         least: float, most: float, raised: float, expected: float) -> None:
     altitude, _ = Altitude(3.0, 0.0, 10.0).control(
         me(2.5), PARAMS, least, most, raised=raised)

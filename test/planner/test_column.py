@@ -61,7 +61,7 @@ def least_distances(v_max: float, count: int) -> Array:
     return least
 
 
-def test_a_column_of_six_keeps_its_margins_if_the_leader_comes_back() -> None:
+def test_column_of_six_keeps_margins_if_leader_returns() -> None:
     assert least_distances(COLUMN_V_MAX, 6)[1:].min() >= MARGIN
 
 
@@ -85,7 +85,7 @@ def test_one_lost_behind_a_follower_in_sight_pushes_nobody_back() -> None:
 
 
 @pytest.mark.parametrize('start', [(4.4, 2.2), (4.9, 0.0)], ids=['beside', 'behind'])
-def test_one_lost_that_comes_is_kept_clear_of_beside_another_in_sight(
+def test_lost_coming_one_is_kept_clear_of_beside_one_in_sight(
         start: tuple[float, float]) -> None:
     """One in sight that is nearer to both hides a vehicle only on the line of sight to it."""
     vehicles = {'ahead': Member(FOLLOWER), 'leader': Member(LEADER)}

@@ -50,7 +50,7 @@ def ranged(stamp: float, distance: float, rate: float = 0.0, towards: Array = AH
     (0.06, 1.0, True), (0.28, 1.0, True), (0.30, 1.0, False), (0.06, 0.3, False),
     (0.06, 10.0, True), (0.5, 0.5, False), (0.28, 0.29, False), (0.29, 0.29, False),
     (float('nan'), 1.0, False)])
-def test_the_distance_is_known_where_the_line_is_and_the_rest_is_not(
+def test_distance_is_known_along_line_and_unknown_elsewhere(
         along: float, across: float, known: bool) -> None:
     turned = np.array([0.6, 0.8, 0.0])
     n = ranged(0.0, 2.0, towards=turned, along=along, across=across)
@@ -64,7 +64,7 @@ def test_a_neighbor_at_the_own_place_is_on_no_sphere() -> None:
     assert clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS) == []
 
 
-def test_it_backs_away_on_the_line_of_the_loss_wherever_the_estimate_has_wandered() -> None:
+def test_retreat_follows_line_of_loss_wherever_estimate_drifts() -> None:
     straight, = clear_of_sphere(ranged(0.0, 1.3, -0.4), seen(), own(), np.zeros(3), PARAMS)
     aside, = clear_of_sphere(ranged(0.0, 1.3, -0.4, np.array([0.6, 0.8, 0.0])), seen(), own(),
                              np.zeros(3), PARAMS)
@@ -88,7 +88,7 @@ def test_fences_go_before_it_once_the_leader_may_have_come_round(age: float, sur
     assert found.normal == pytest.approx(-AHEAD)
 
 
-def test_an_uncertain_distance_is_taken_for_less_and_an_old_one_ever_less() -> None:
+def test_uncertain_distance_counts_as_less_old_one_ever_less() -> None:
     def lowest(n: Neighbor) -> float:
         return clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS)[0].least
 
@@ -120,7 +120,7 @@ class Ranging(Follower):
         return decision
 
 
-def test_a_neighbor_of_which_only_the_distance_is_known_is_not_followed() -> None:
+def test_neighbor_with_only_distance_known_is_not_followed() -> None:
     follower = Ranging()
     decisions = [follower.unseen(0.4) for _ in range(40)]
     assert decisions[-1].state is State.HOLD

@@ -93,7 +93,7 @@ def test_near_the_band_the_vertical_part_stays(seed: int, count: int) -> None:
 
 
 @given(SEED, st.integers(0, 3))
-def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, count: int) -> None:
+def test_command_within_every_bound_is_returned_bit_for_bit(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
     around = [b for b in around if b.normal @ a >= b.least]
     command = guard(a, v, sort_bounds(around), A_MAX, V_MAX, T)
@@ -103,7 +103,7 @@ def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, cou
 
 @given(SEED)
 @example(3243)  # the bounds contradict each other: separation comes first
-def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_max(
+def test_one_neighbor_clips_radial_part_rest_shrinks_to_a_max(
         seed: int) -> None:
     a, v, _ = situation(seed, 0)
     rng = np.random.default_rng(seed)
@@ -133,7 +133,7 @@ def test_at_v_max_the_radial_part_comes_first(seed: int) -> None:
     assert np.linalg.norm(v + command * T) == pytest.approx(V_MAX)
 
 
-def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows() -> None:
+def test_nearer_of_two_is_avoided_first_farther_as_allowed() -> None:
     x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     around = [*pair(1.2, -x, 1.0, 9.0), *pair(1.3, y, 2.5, 9.0), *pair(1.1, x, 1.5, 9.0)]
     command = guard(np.zeros(3), np.zeros(3), sort_bounds(around), A_MAX, 9.0, T)
@@ -141,7 +141,7 @@ def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows
     assert command.reason == 'separation'
 
 
-def test_who_is_seen_comes_before_who_is_only_supposed_to_be_somewhere_nearer() -> None:
+def test_one_in_sight_comes_before_nearer_assumed_one() -> None:
     x = np.array([1.0, 0.0, 0.0])
     around = [*pair(0.1, x, 1.5, seen=False), *pair(1.1, -x, 1.0, 9.0)]
     command = guard(np.zeros(3), np.zeros(3), sort_bounds(around), A_MAX, V_MAX, T).acceleration
@@ -177,7 +177,7 @@ def test_bounds_are_those_of_the_formula() -> None:
         common - (rate - far_speed) / PARAMS.T_g - far_slope * rate)
 
 
-def test_one_that_may_be_anywhere_in_a_growing_sphere_is_kept_clear_of_earlier() -> None:
+def test_one_in_a_growing_sphere_is_kept_clear_of_earlier() -> None:
     known = bounds((-2.0, 0.0, 0.0), (0.2, 0.0, 0.0))
     unsure = radial_bounds((-2.0, 0.0, 0.0), (0.2, 0.0, 0.0),
                            BAND._replace(spread=0.3, spreading=0.5), PARAMS)

@@ -98,7 +98,7 @@ def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: 
 COMING = LOST._replace(approach=1.0, side=np.array([0.0, 1.0, 0.0]))
 
 
-def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> None:
+def test_coming_one_passes_below_only_under_explicit_ceiling() -> None:
     explicit = replace(PARAMS, altitude_max=20.0, retreat_max=1.0)
     back = -1.0 * AHEAD
     at_height = COMING._replace(height=0.0)
@@ -111,7 +111,7 @@ def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> Non
 
 
 @pytest.mark.parametrize('y', [-1.6, 1.6])
-def test_leaving_the_path_of_one_is_no_way_into_another_out_of_sight(y: float) -> None:
+def test_leaving_one_path_leads_into_no_other_out_of_sight(y: float) -> None:
     follower, other = Follower(PARAMS, PARAMS.response_time), (-1.8, y, 2.0)
     for tick in range(90):
         follower.tick(*[
@@ -146,7 +146,7 @@ def test_the_side_of_a_path_is_its_own(offset: list[float], side: float) -> None
     assert across_path(np.zeros(3), np.array(offset)) == pytest.approx(np.zeros(3))
 
 
-def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
+def test_it_flies_no_farther_along_line_of_sight_than_was_free() -> None:
     *_, (position, _) = pushed(lambda p, v: sort_bounds(
         [], fences(LOST._replace(origin=p), p, v, PARAMS)), velocity=(0.5, 0.0, 0.0))
     assert position[0] == pytest.approx(2.0 - PARAMS.guarding.m, abs=0.05)
@@ -159,7 +159,7 @@ def near(position: list[float], velocity: list[float], radius: float = 0.0) -> N
 OWN = own(0.0, np.zeros(3))
 
 
-def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
+def test_it_neither_climbs_into_one_above_nor_sinks_onto_one() -> None:
     still = [0.0, 0.0, 0.0]
     assert climb_range([near([0.1, 0.0, 0.8], still)], OWN, PARAMS)[1] < -0.2
     least, most = climb_range([near([0.1, 0.0, 1.2], still)], OWN, PARAMS)
@@ -170,7 +170,7 @@ def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
     assert climb_range([near([1.4, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
 
 
-def test_the_climb_keeps_the_height_that_the_slant_distance_asks_for() -> None:
+def test_climb_keeps_height_that_slant_distance_needs() -> None:
     level, height = 0.5, 0.8  # |r| = 0.94 m, less than sqrt(d0) = 1 m
     too_near = height - math.sqrt(1.0 - level ** 2)
     assert climb_range([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[

@@ -64,7 +64,7 @@ def fly(loop: PlannerLoop, now: int, seen: int | None = None) -> tuple[Decision,
 
 @pytest.mark.parametrize('start', [START, TICK], ids=['wall time', 'simulated time'])
 @pytest.mark.parametrize('age', [0, 1, 40 * MS, 70 * MS + 1])
-def test_a_command_bears_the_stamp_of_what_it_rests_on_to_the_nanosecond(
+def test_command_bears_stamp_of_its_image_to_the_nanosecond(
         age: int, start: int) -> None:
     loop = engaged()
     for now in (start, start + TICK, start + TICK + 1, start + HOUR, start + HOUR + TICK):
@@ -111,7 +111,7 @@ def test_what_came_is_handed_on_once() -> None:
 
 @pytest.mark.parametrize(('axis', 'state'), [
     (0, State.SEARCH), (2, State.SEARCH), (3, State.TRACK), (5, State.TRACK)])
-def test_an_uncertain_place_is_not_followed_and_an_uncertain_attitude_is(
+def test_uncertain_place_is_not_followed_uncertain_attitude_is(
         axis: int, state: State) -> None:
     loop, covariance = engaged(), SURE.copy()
     covariance[axis, axis] = 100.0
@@ -133,7 +133,7 @@ def test_the_yaw_of_a_neighbor_is_known_up_to_a_deviation(std: float, known: boo
     assert (loop.memory.neighbors['leader'].yaw is not None) == known
 
 
-def test_only_a_seen_neighbor_has_an_acceleration_and_the_faced_one_the_distance() -> None:
+def test_only_seen_neighbor_has_acceleration_faced_one_distance() -> None:
     loop = engaged()
     assert loop.distance() is None
     accelerates = leader(START)._replace(acceleration=np.array([0.3, 0.0, 0.0]))
@@ -170,7 +170,7 @@ def test_a_frozen_camera_is_braked_on_as_if_there_were_none() -> None:
     assert watched(loop, late + 1).state is State.TRACK
 
 
-def test_images_that_cease_after_a_clock_jumped_back_are_missed_no_later() -> None:
+def test_images_that_stop_after_clock_jump_are_missed_in_time() -> None:
     loop = engaged()
     loop.take_frame(START + HOUR, START + HOUR)
     assert watched(loop, START + HOUR).state is State.TRACK
@@ -180,7 +180,7 @@ def test_images_that_cease_after_a_clock_jumped_back_are_missed_no_later() -> No
     assert watched(loop, late).state is State.HOLD
 
 
-def test_the_same_odometry_again_shows_no_rhythm_and_a_jump_back_ends_it() -> None:
+def test_repeated_odometry_shows_no_rhythm_jump_back_ends_it() -> None:
     loop, second = engaged(), 10**9
     arrived = [(1, 0), (1, 1), (1, 2), (2, 4), (2, 5), (3, 5), (0, 6)]  # stamp and arrival, s
     for (stamp, arrival), ages in zip(arrived, ([], [], [], [3], [3], [3, 3], [])):
@@ -197,7 +197,7 @@ def test_odometry_at_10_hz_is_not_late_between_its_messages() -> None:
         assert stamp == START or decision.state is State.TRACK
 
 
-def test_after_a_jump_of_the_odometry_the_height_at_arming_is_unknown() -> None:
+def test_height_at_arming_is_unknown_after_odometry_jump() -> None:
     loop = engaged()
     loop.ground = 0.4
     for now, height, ground in ((START, 2.0, 0.4), (START + TICK, 3.0, None)):

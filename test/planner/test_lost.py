@@ -95,7 +95,7 @@ def test_an_acceleration_counts_as_far_as_it_is_more_than_noise(reported: float,
     assert estimated[0] == estimated[2] == 0.0
 
 
-def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> None:
+def test_coasting_turns_after_it_then_looks_back_then_around() -> None:
     follower = Follower()
     for tick in range(10):
         follower.tick(seen(follower.now, [2.0, 0.06 * tick, 2.0], (0.0, 0.6, 0.0)))
@@ -135,7 +135,7 @@ def test_the_retreat_is_shorter_by_the_distance_beyond_the_band(distance: float,
 
 
 @pytest.mark.parametrize('speed', [1.8, -1.8])
-def test_without_a_known_place_after_a_jump_of_the_odometry_it_soon_stops(speed: float) -> None:
+def test_unknown_place_after_odometry_jump_soon_stops_it(speed: float) -> None:
     params = PlannerParams(v_max=2.0)
     follower = Follower(params, params.response_time)
     follower.velocity = np.array([speed, 0.0, 0.0])
@@ -193,7 +193,7 @@ def test_one_that_returns_too_near_is_not_faded_in() -> None:
     ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'retreat_max': 0.0}, None),
     ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'retreat_max': 0.15}, (-0.25, 0.0, 0.0)),
     ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'guard': False}, None)])
-def test_it_names_the_velocity_that_keeps_the_distance_if_odometry_is_lost(
+def test_it_names_velocity_keeping_distance_if_odometry_is_lost(
         velocity: tuple[float, ...], acceleration: tuple[float, ...], changes: dict[str, Any],
         retreat: tuple[float, ...] | None) -> None:
     decision = Follower(replace(PARAMS, **changes)).tick(

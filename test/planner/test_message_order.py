@@ -166,7 +166,7 @@ def state(name: str, stamp: int, position: Sequence[float], frame: str = 'odom')
                          np.zeros(3), np.zeros(3), covariance, covariance, np.eye(3))
 
 
-def test_states_and_accelerations_on_two_topics_may_come_in_any_order() -> None:
+def test_states_and_accelerations_may_come_in_any_order() -> None:
     """Each state gets the acceleration of its own image, whichever message comes first."""
     tick, image = 100_000_000, 33_000_000
     first = None

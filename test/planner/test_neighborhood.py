@@ -87,7 +87,7 @@ def test_an_edge_goes_when_another_is_clearly_nearer_to_both(nearer: float, kept
     assert ('far' in edges(set(), own(), [far, between], PARAMS)) == (nearer == 1.0)
 
 
-def test_the_only_leader_in_sight_keeps_its_edge_whatever_is_received() -> None:
+def test_only_leader_in_sight_keeps_edge_whatever_is_received() -> None:
     leader = at('leader', 3.0, 0.0, 0.0)
     between = at('follower_2', 1.5, 0.0, 0.0, received=True)
     assert edges(set(), own(), [leader, between], PARAMS) == {'leader', 'follower_2'}
@@ -97,7 +97,7 @@ def test_the_only_leader_in_sight_keeps_its_edge_whatever_is_received() -> None:
 
 @pytest.mark.parametrize(('distance', 'held', 'kept'), [
     (2.8, 'between', True), (2.9, 'between', False), (2.9, 'leader', True)])
-def test_beyond_the_band_no_edge_to_the_only_leader_in_sight_begins(
+def test_no_edge_to_only_leader_in_sight_begins_beyond_band(
         distance: float, held: str, kept: bool) -> None:
     flock = [at('between', 0.5 * distance, 0.0, 0.0, received=True), at('leader', distance, 0, 0)]
     assert ('leader' in edges({held}, own(), flock, PARAMS)) is kept
@@ -118,7 +118,7 @@ def test_the_faced_neighbor_changes_for_one_clearly_nearer(before: str, expected
         assert faced is not None and faced.name == found
 
 
-def test_in_a_column_it_faces_the_follower_ahead_and_not_the_leader_beyond() -> None:
+def test_column_member_faces_follower_ahead_not_leader_beyond() -> None:
     flock = [at('ahead', 1.8, 0.0, 0.0, role=FOLLOWER), at('leader', 3.0, 1.0, 0.0)]
     faced = build_neighborhood(Memory(), own(), flock, PARAMS, 0.1).faced
     assert faced is not None and faced.name == 'ahead'

@@ -110,7 +110,7 @@ def test_track_applies_the_law_to_states_predicted_to_now() -> None:
     assert decision.yaw == pytest.approx(math.atan2(y, x) + 0.4 * passing)  # of when it is there
 
 
-def test_losing_the_leader_leads_over_predicting_and_coasting_to_holding_and_back() -> None:
+def test_lost_leader_is_predicted_coasted_held_and_found() -> None:
     memory, states, along = tracking(velocity=(0.2, 0.0, 0.0)), [], []
     for tick in range(1, 30):
         me = own(0.1 * tick, velocity=(0.3, 0.0, 0.0))
@@ -165,7 +165,7 @@ def test_without_usable_odometry_there_is_no_command(me: OwnState | None,
     assert memory.own is None
 
 
-def test_odometry_that_stops_in_flight_stops_the_commands_and_says_so() -> None:
+def test_odometry_stopped_in_flight_stops_commands_with_reason() -> None:
     memory, decision = step(tracking(), 0.15, True, None, [leader(0.15)], PARAMS)
     assert decision.state is State.TRACK
     memory, decision = step(memory, 0.25, True, None, [leader(0.25)], PARAMS)
@@ -177,7 +177,7 @@ def test_odometry_that_stops_in_flight_stops_the_commands_and_says_so() -> None:
     assert odometry_fault(memory.own, 0.2, PARAMS) == ''
 
 
-def test_odometry_that_jumps_takes_its_new_altitude_and_forgets_the_neighbors() -> None:
+def test_odometry_jump_takes_new_altitude_forgets_neighbors() -> None:
     memory, jumped = tracking(), (0.0, 0.0, 2.35)
     memory, decision = step(memory, 0.1, True, own(0.1, jumped), [], PARAMS)
     assert [r.reason for r in decision.rejected] == ['odometry jumped']
@@ -212,7 +212,7 @@ def test_odometry_that_comes_late_does_not_replace_newer() -> None:
     (leader(1.0, velocity_covariance=np.full((3, 3), np.nan)), 'too uncertain',
      'variance of its velocity nan'),
 ])
-def test_a_bad_estimate_is_refused_with_a_reason_and_prediction_goes_on(
+def test_bad_estimate_is_refused_with_reason_prediction_goes_on(
         bad: Neighbor, reason: str, detail: str) -> None:
     decision = decide(1.0, bad)
     assert decision.state is State.SEARCH
@@ -222,7 +222,7 @@ def test_a_bad_estimate_is_refused_with_a_reason_and_prediction_goes_on(
     assert np.array_equal(commanded(with_bad), commanded(good))
 
 
-def test_the_newest_estimate_of_a_name_counts_whatever_the_order_of_arrival() -> None:
+def test_newest_estimate_of_a_name_counts_in_any_order() -> None:
     old, new = leader(0.1, (1.5, 0.0, 2.0)), leader(0.2, (2.5, 0.0, 2.0))
     me = own(0.2, velocity=(0.0, 0.1, 0.0))
     forward, backward, alone = (
@@ -254,7 +254,7 @@ def test_a_jump_back_in_time_forgets_the_inputs_of_before() -> None:
         assert decision.state is State.SEARCH
 
 
-def test_yaw_faces_the_leader_and_is_kept_when_it_is_lost_or_overhead() -> None:
+def test_yaw_faces_leader_and_is_kept_when_lost_or_overhead() -> None:
     memory, decision = step(Memory(), 0.0, True, own(), [leader(0.0, (0.0, -2.0, 2.0))], LAW)
     assert decision.yaw == pytest.approx(-math.pi / 2)
     for now, seen in ((0.2, [leader(0.2, (0.05, 0.05, 4.0))]), (1.5, [])):
@@ -262,14 +262,14 @@ def test_yaw_faces_the_leader_and_is_kept_when_it_is_lost_or_overhead() -> None:
         assert decision.yaw == pytest.approx(-math.pi / 2)
 
 
-def test_seen_again_during_a_turn_it_turns_back_from_where_it_points() -> None:
+def test_leader_seen_during_turn_turns_it_back() -> None:
     """Turning on to the yaw commanded last it lost the leader again."""
     memory = tracking()._replace(yaw=0.8, params=None)
     decision = decide(0.1, leader(0.1), me=own(0.1, yaw=0.3), memory=memory)
     assert decision.yaw == pytest.approx(0.2)
 
 
-def test_yaw_and_altitude_of_the_engagement_are_held_if_their_modes_say_so() -> None:
+def test_engagement_yaw_and_altitude_are_held_by_mode() -> None:
     params = PlannerParams(yaw_mode='hold', altitude_mode='hold')
     memory, _ = step(Memory(), 0.0, True, own(yaw=1.1), [leader()], params)
     above = leader(0.1, (2.0, 0.0, 3.0))
@@ -320,7 +320,7 @@ def test_the_guard_acts_at_once_while_the_law_is_being_faded_in() -> None:
     assert 'separation' in decision.limits
 
 
-def test_with_nothing_at_risk_guard_and_law_command_the_same_bit_for_bit() -> None:
+def test_guard_equals_law_bit_for_bit_without_risk() -> None:
     rng = np.random.default_rng(5)
     memories = [Memory(), Memory()]
     for tick in range(200):
@@ -349,7 +349,7 @@ def test_coasting_keeps_clear_of_where_a_lost_neighbor_should_be(
         assert np.array_equal(commanded(free), np.zeros(3))
 
 
-def test_one_that_is_lost_is_kept_clear_of_while_another_is_followed() -> None:
+def test_lost_one_is_kept_clear_of_while_other_is_followed() -> None:
     near = leader(0.0, (1.5, 0.0, 2.0), (-0.3, 0.0, 0.0), name='near')
     memory, _ = step(Memory(), 0.0, True, own(), [near], PARAMS)
     for tick in range(1, 11):
@@ -415,7 +415,7 @@ def draw_state(rng: np.random.Generator, now: float) -> tuple[float, Array, Arra
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2 ** 32), st.integers(1, 8), st.sampled_from(ALTITUDE_MODES))
 @pytest.mark.filterwarnings('ignore:overflow')
-def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, count: int,
+def test_no_command_is_stale_or_beyond_limits(seed: int, count: int,
                                                                   altitude_mode: str) -> None:
     """Whatever comes, of neighbors of any kind."""
     rng = np.random.default_rng(seed)
@@ -472,7 +472,7 @@ def test_default_law_is_that_of_the_papers_flights() -> None:
     assert PARAMS.law == FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
 
 
-def test_a_leader_suddenly_elsewhere_is_not_used_until_the_old_one_is_too_old() -> None:
+def test_leader_suddenly_elsewhere_is_unused_until_old_expires() -> None:
     memory = tracking()
     for tick in range(1, 4):
         memory, _ = step(memory, 0.1 * tick, True, own(0.1 * tick),
@@ -486,7 +486,7 @@ def test_a_leader_suddenly_elsewhere_is_not_used_until_the_old_one_is_too_old() 
     assert memory.neighbors['leader'].position == pytest.approx(far)
 
 
-def test_a_guessed_acceleration_of_a_leader_out_of_sight_is_not_flown_after() -> None:
+def test_guessed_acceleration_of_hidden_leader_is_not_flown() -> None:
     params, memory = PlannerParams(v_max=2.0), Memory()
     for tick in range(12):  # hovering; its velocity seems to grow, then it is not seen any more
         now = 0.1 * tick
@@ -540,6 +540,6 @@ FAST, SLOW, TOO_SLOW = (0.03,) * 20, (0.16,) * 20, (0.26,) * 20
     (0.19, (*FAST[1:], 0.16), ''), (0.24, (*FAST[1:], 0.5), ''),  # after one hiccup
     (0.25, (*FAST[1:], 0.5), 'odometry late (0.25 s)'),
     (0.02, TOO_SLOW, 'odometry too slow (0.26 s old before the next comes)')])
-def test_odometry_is_late_by_the_age_that_its_messages_usually_reach(
+def test_odometry_is_late_by_age_its_messages_usually_reach(
         age: float, ages: tuple[float, ...], reason: str) -> None:
     assert odometry_delay(own(1.0)._replace(ages=ages), 1.0 + age, PARAMS) == reason

@@ -77,7 +77,7 @@ def bounds(rng: Generator, discs: Discs, kind: str, most: int) -> list[Side]:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_the_first_bounds_first_is_what_trying_all_candidates_finds(kind: str) -> None:
+def test_priority_solution_equals_search_of_all_candidates(kind: str) -> None:
     for case in range(CASES):
         rng = np.random.default_rng([2, KINDS.index(kind), case])
         discs = two_discs(rng, DISCS[rng.integers(len(DISCS))])
@@ -88,7 +88,7 @@ def test_the_first_bounds_first_is_what_trying_all_candidates_finds(kind: str) -
 
 
 @pytest.mark.parametrize('far', [False, True])
-def test_the_best_point_or_none_is_what_trying_all_candidates_finds(far: bool) -> None:
+def test_best_point_equals_search_of_all_candidates(far: bool) -> None:
     none = 0
     for case in range(CASES):
         rng = np.random.default_rng([2, case])
@@ -102,7 +102,7 @@ def test_the_best_point_or_none_is_what_trying_all_candidates_finds(far: bool) -
     assert 0.1 * CASES < none < 0.5 * CASES
 
 
-def test_bounds_that_exclude_one_another_by_rounding_only_are_all_met() -> None:
+def test_bounds_that_conflict_by_rounding_are_all_met() -> None:
     """Whichever way a comparison falls out, and whatever bound beyond reach comes after them."""
     for case in range(500):
         rng = np.random.default_rng([2, case])

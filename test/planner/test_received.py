@@ -55,7 +55,7 @@ def test_a_fresh_sighting_is_never_replaced_by_a_received_state() -> None:
 
 
 @pytest.mark.parametrize('x', [2.1, 4.0])  # a little, and a jump
-def test_a_sighting_replaces_a_received_state_at_once_even_a_newer_one(x: float) -> None:
+def test_sighting_replaces_received_state_even_a_newer_one(x: float) -> None:
     memory, _ = decide(Memory(), 0.1, reported(0.1, 2.0))
     memory, decision = decide(memory, 0.2, reported(0.05, x, received=False))
     assert place(memory) == x and decision.rejected == ()
@@ -79,7 +79,7 @@ def command(variance: float) -> Array:
     return decision.acceleration
 
 
-def test_the_less_certain_a_received_state_the_farther_away_it_stays() -> None:
+def test_uncertain_received_state_keeps_it_farther_away() -> None:
     pushed = [command(variance)[0] for variance in (0.0, 0.02, 0.04, 0.08)]
     assert pushed[0] > -0.3
     assert np.all(np.diff(pushed[:3]) < 0.0) and max(pushed[2:]) < -1.0
@@ -111,7 +111,7 @@ def test_after_resume_timeout_it_turns_to_the_one_received() -> None:
     assert not any('looks for' in warning for warning in decisions[-1].warnings)
 
 
-def test_it_looks_for_a_leader_that_it_only_received_if_no_neighbor_is_in_view() -> None:
+def test_received_leader_is_searched_if_no_neighbor_is_in_view() -> None:
     follower, _ = fly(1.0, 'ahead', 'leader behind')
     follower, _ = fly(3.0, 'ahead', 'behind', follower)
     assert not follower.memory.looking  # it stays with the one ahead
@@ -131,7 +131,7 @@ def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
     assert not any('looks for' in warning for d in decisions for warning in d.warnings)
 
 
-def test_pushed_back_it_passes_beside_a_follower_that_fell_silent() -> None:
+def test_pushed_back_it_passes_beside_silent_follower() -> None:
     """The computer of the one behind failed 4 s before the leader comes back."""
     follower = Follower(replace(PARAMS, v_max=1.0), 0.2)
     behind, leader = np.array([-1.8, 0.0, 2.0]), np.array([2.0, 0.0, 2.0])

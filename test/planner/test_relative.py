@@ -69,7 +69,7 @@ def flown(duration, start=2.0, drift=0.0, stops_at=math.inf, tilted=0.0):
 
 
 @pytest.mark.parametrize('drift', [0.0, 3.0, -3.0])
-def test_it_is_led_to_the_middle_of_the_band_whatever_the_velocity_that_both_have(drift):
+def test_it_reaches_middle_of_band_at_any_common_velocity(drift):
     for start in (1.1, 2.7):
         distances = flown(20.0, start, drift)
         assert distances.min() > 1.0 and distances.max() < 2.83
@@ -84,7 +84,7 @@ def test_an_error_of_the_tilt_is_offset(tilted):
 
 
 @pytest.mark.parametrize('error', [0.6, -0.6])
-def test_an_error_of_the_thrust_that_grows_without_odometry_is_offset(error):
+def test_thrust_error_growing_without_odometry_is_offset(error):
     memory, z, v, a, offs = Memory(), 0.0, 0.0, 0.0, []
     for k in range(150):
         now = 0.1 * k
@@ -124,7 +124,7 @@ def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     ([leader(5.0, name='leader/duplicate')], 0.0, 'no neighbor in sight'),
     ([leader(5.0, (4.0, 0.0, 0.0))], 0.0, 'leader is 4.0 m away'),
     ([leader(5.0)], 0.31, '0.31 s old')])
-def test_without_the_marker_nearby_or_the_attitude_nothing_is_commanded(seen, own_age, reason):
+def test_nothing_is_commanded_without_marker_or_attitude(seen, own_age, reason):
     memory, _ = tick(Memory(), 5.0 - own_age, [])
     _, decision = step(memory, 5.0, True, None, seen, replace(PARAMS, predict_timeout=1.0))
     assert (decision.state, decision.acceleration) == (State.HOLD, None)
@@ -145,7 +145,7 @@ def test_another_neighbor_in_the_way_is_not_approached():
     assert tick(memory, 5.0, [far, near])[1].acceleration[0] <= 0.0
 
 
-def test_a_change_of_the_odometry_forgets_all_places_and_changes_the_command_slowly():
+def test_odometry_change_forgets_places_and_ramps_command():
     memory, last = Memory(), None
     changes = []
     for k in range(60):

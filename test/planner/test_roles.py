@@ -54,7 +54,7 @@ def test_one_to_avoid_is_never_followed() -> None:
         assert memory.altitude is not None and memory.altitude.held == 2.0
 
 
-def test_a_second_print_of_the_leaders_marker_is_avoided_and_never_followed() -> None:
+def test_second_print_of_leader_is_avoided_never_followed() -> None:
     params = PlannerParams(vehicles={'leader': Member('leader', 0.3)})
     _, decision = decide(seen('leader/duplicate', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
                          params=params)
@@ -68,7 +68,7 @@ def test_a_second_print_of_the_leaders_marker_is_avoided_and_never_followed() ->
 
 
 @pytest.mark.parametrize('following', [False, True])
-def test_one_to_avoid_is_kept_clear_of_whether_or_not_another_is_followed(
+def test_avoided_one_is_kept_clear_of_with_or_without_leader(
         following: bool) -> None:
     near = seen('stranger', 0.0, 1.1, 0.0, (-0.3, 0.0, 0.0))
     leader = [seen('leader', 0.0, 0.0, 2.1)] if following else []
@@ -114,7 +114,7 @@ def test_hulls_that_overlap_are_driven_apart() -> None:
         -EDGE_RETURN_SPEED / params.guarding.T_g, rel=1e-3)
 
 
-def test_each_vehicle_of_the_file_that_is_neither_seen_nor_received_is_reported() -> None:
+def test_listed_vehicle_neither_seen_nor_received_is_reported() -> None:
     params = PlannerParams(vehicles={
         'leader': Member(), 'a': Member('follower'), 'b': Member('follower'), **STRANGER})
     leader, beside = seen('leader', 0.0, 2.0), seen('a', 0.0, 1.0, 1.8)

@@ -130,7 +130,7 @@ def test_height_alone_never_forces_it_to_move() -> None:
 
 
 @pytest.mark.parametrize('side', [1.0, -1.0])
-def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with(side: float) -> None:
+def test_one_that_passes_too_fast_to_turn_is_flown_along_with(side: float) -> None:
     slow = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, side, 0.0))
     fast = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.8 * side, 0.0))
     assert slow == pytest.approx(np.zeros(3))
@@ -207,14 +207,14 @@ def test_three_images_in_a_row_without_it_make_it_occluded() -> None:
         assert occlusion(None, beside, ME, frames(0.8, 0.9, 1.0), AHEAD, 0.0) is None
 
 
-def test_a_camera_that_is_tilted_by_an_acceleration_looks_elsewhere() -> None:
+def test_camera_tilted_by_acceleration_looks_elsewhere() -> None:
     high, images = leader(0.7, z=2.25), frames(0.8, 0.9, 1.0)
     assert occlusion(None, high, ME, images, AHEAD, 0.0)
     assert occlusion(None, high, ME, images, AHEAD, 2.5) is None
     assert occlusion(None, high, ME, images, AHEAD, -2.5)
 
 
-def test_without_a_calibration_or_an_own_sighting_nothing_is_occluded() -> None:
+def test_nothing_is_occluded_without_calibration_or_sighting() -> None:
     images = frames(0.8, 0.9, 1.0)
     assert occlusion(None, leader(0.7), ME, images, (), 0.0) is None
     assert occlusion(None, None, ME, images, AHEAD, 0.0) is None

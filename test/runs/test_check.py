@@ -76,7 +76,7 @@ def test_the_newest_recording_is_the_one_of_the_largest_number(tmp_path: Path) -
     assert newest_recording(tmp_path) == tmp_path / names[2]
 
 
-def test_a_report_of_a_running_system_holds_the_recording_of_its_black_box(
+def test_report_of_running_system_holds_black_box_recording(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     statuses = {'a/black_box': NodeStatus(0, '', {'recording': str(SAMPLE)})}
     monkeypatch.setattr(check, '_observe', lambda options: (
@@ -137,7 +137,7 @@ def test_a_bag_that_holds_less_than_it_announces_is_incomplete(
     assert 'announced messages found' in checked(capsys, bag)[1]['bag']['measured']
 
 
-def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
+def test_flight_behind_leader_shows_focal_length_and_mounting(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def longer(message: Any) -> None:
         message.k = message.k * np.array([1.2, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0, 1.0, 1.0])
@@ -150,7 +150,7 @@ def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
     assert_told(found, ('error', 'camera mounting', 'looks higher', 'camera_rpy:=['))
 
 
-def test_the_table_names_the_topic_to_remap_and_ends_with_the_verdict(
+def test_table_names_topic_to_remap_and_ends_with_verdict(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = excerpt(tmp_path / 'bag', 1.5, altered('/odom', topic='/vio/odometry'))
     (bag / MARK).touch()

@@ -85,7 +85,7 @@ def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
         assert 'px wide, in 100%' in measured['marker']
 
 
-def test_nodes_that_are_started_wrongly_are_reported_with_the_remedy(tmp_path: Path) -> None:
+def test_wrongly_started_nodes_are_reported_with_remedy(tmp_path: Path) -> None:
     with Processes(dict(os.environ), tmp_path) as processes:
         for name in ('first', 'second'):
             processes.start(name, PROGRAMS['planner'])

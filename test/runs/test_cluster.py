@@ -68,7 +68,7 @@ def test_a_cluster_writes_the_same_files_as_this_process(
 
 
 @pytest.mark.ros
-def test_where_no_scheduler_answers_it_is_a_message_not_a_traceback(
+def test_missing_scheduler_is_a_message_not_a_traceback(
         monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('distributed')
     monkeypatch.setattr('flock_desk.runs.processes.SCHEDULER_TIMEOUT', 1.0)

@@ -120,7 +120,7 @@ def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: Flight) 
     assert all(j.fault for j in judge(BOUNDS, {}))
 
 
-def test_commands_and_law_point_the_same_way_unless_a_sign_is_turned(flight: Flight) -> None:
+def test_commands_and_law_agree_unless_a_sign_is_turned(flight: Flight) -> None:
     share = replay_figures(flight, {})['planner']['along_law_share']
     # Here the planner brakes the bag's follower, which is faster than 0.5 m/s, against the law.
     assert len(flight.along_law) > 40 and share > 0.6
@@ -152,7 +152,7 @@ def test_a_flight_without_a_command_is_judged_by_what_is_known(
         'speed_max_m_s = 6: must be at most 2']
 
 
-def test_a_process_that_was_cut_off_while_it_waited_is_late_not_failed(flight: Flight) -> None:
+def test_process_cut_off_while_waiting_is_late_not_failed(flight: Flight) -> None:
     summary = replay_figures(flight, {'planner': 0, 'replay': 3, 'recorder': -9})
     assert (summary['failed_processes'], summary['late_processes']) == (1, 1)
 

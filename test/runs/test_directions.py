@@ -40,7 +40,7 @@ def log(setpoint, velocity):
     ([1.0, 0.0, -1.2], -EAST, True, 0.0), (-EAST, EAST, True, 0.0), (-EAST, -EAST, True, 1.0),
     (-EAST, EAST, False, 0.0), (EAST, EAST, False, 1.0),
     ([0.0, 0.0, 1.0], [0.0, 0.0, 1.0], False, 1.0)])
-def test_a_turned_sign_is_against_the_command_or_along_the_velocity(
+def test_turned_sign_is_against_command_or_along_velocity(
         setpoint, velocity, commanded, share):
     commands = [(0.1 * k - 0.01, command(EAST)) for k in range(50)] if commanded else []
     judged = opposed(log(np.array(setpoint), np.array(velocity)), commands)

@@ -109,7 +109,7 @@ def test_every_module_on_the_page_of_the_house_exists():
         assert (ROOT / 'flock_follower' / name).exists() or (ROOT / name).exists(), name
 
 
-def test_the_way_of_an_image_is_through_functions_that_exist_and_are_counted():
+def test_path_of_an_image_is_through_existing_functions():
     text = ARCHITECTURE.read_text()
     table = text.partition('| file | functions')[2].partition('\n\n')[0]
     functions, files = set(), set()

@@ -89,7 +89,7 @@ def with_ranges(path: Path, seen: float, seconds: float) -> Path:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_ranges_in_a_bag_are_used_where_the_neighbor_is_not_in_sight(tmp_path: Path) -> None:
+def test_ranges_in_a_bag_are_used_out_of_sight(tmp_path: Path) -> None:
     bag_path = with_ranges(tmp_path / 'bag', 1.5, 4.0)
     assert main([str(bag_path), '--output', str(tmp_path / 'out')]) == 0
     with open_bag(bag_path) as bag, open_bag(tmp_path / 'out' / 'result.mcap') as result:
@@ -148,7 +148,7 @@ def late(message: BagMessage) -> BagMessage:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_errors_of_check_fail_the_run_and_stand_before_the_figures(
+def test_check_errors_fail_run_and_stand_before_figures(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     what = 'odom latency: '
     out, spoilt = tmp_path / 'out', excerpt(tmp_path / 'bag', 1.2, late)
@@ -222,7 +222,7 @@ def test_after_a_gap_all_begins_anew_and_figures_leave_it_out(tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_bytes_that_are_no_message_are_counted_and_the_progress_is_shown(
+def test_invalid_bytes_are_counted_and_progress_is_shown(
         tmp_path: Path, capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_line, 'LOG_PERIOD', 0.0)  # as of a long bag
@@ -240,7 +240,7 @@ def test_bytes_that_are_no_message_are_counted_and_the_progress_is_shown(
     assert 'odom: 1 of 240' in error and '50% of bag\n' in error
 
 
-def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Path) -> None:
+def test_errors_without_truth_are_null_recall_of_all_images(tmp_path: Path) -> None:
     bag = excerpt(tmp_path / 'bag', 0.5, without(*TRUTH))
     assert main([str(bag), '--output', str(tmp_path)]) == 0
     figures = summary(tmp_path)
@@ -262,7 +262,7 @@ def test_a_broken_bound_is_exit_code_1_and_named(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_a_truth_of_another_name_is_reported_and_topics_may_be_in_a_namespace(
+def test_truth_of_another_name_is_reported_in_any_namespace(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def renamed(message: BagMessage) -> BagMessage:
         if message.topic == '/truth/neighbors':
@@ -297,7 +297,7 @@ INFO = 'sensor_msgs/msg/CameraInfo'
     ({'/image_raw': IMAGE, '/camera_info': INFO, '/odom': ODOMETRY}, {'image_raw': '/cam/image'},
      'no message on /cam/image; it holds /image_raw, /camera_info, /odom; '
      '/image_raw holds sensor_msgs/msg/Image: --remap image_raw:=/image_raw')])
-def test_topics_that_are_missing_or_of_another_type_are_named_with_those_that_fit(
+def test_missing_or_mistyped_topics_are_named_with_candidates(
         types: dict[str, str], remaps: dict[str, str], message: str) -> None:
     bag: Any = SimpleNamespace(path='bag', topics={
         name: SimpleNamespace(msgtype=msgtype, count=1) for name, msgtype in types.items()})
@@ -319,7 +319,7 @@ def test_bad_files_are_exit_code_2_and_one_line(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
+def test_black_box_recording_is_judged_by_parameters_flown(
         result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     box = excerpt(tmp_path / 'box')
     (box / 'parameters.yaml').write_text(

@@ -79,7 +79,7 @@ def assert_legible(figure: Figure, name: str) -> None:
         assert box.y0 >= 0.0 and box.y1 <= figure.bbox.y1, (name, text.get_text())
 
 
-def test_every_figure_is_legible_and_one_is_written_in_every_kind(
+def test_every_figure_is_legible_one_is_written_in_every_kind(
         redrawn: tuple[Path, dict[str, Figure]]) -> None:
     out, kept = redrawn
     assert {p.name for p in out.iterdir() if p.is_file()} == {
@@ -107,7 +107,7 @@ def test_only_the_law_keeps_the_band_in_both_scenarios(
     assert [f'{float(r["to 1 % [s]"]):.2f}' for r in rows[:2]] == ['5.64', '1.98']  # for good
 
 
-def test_controllers_are_compared_at_each_v_max_by_the_scenarios_that_all_flew(
+def test_controllers_are_compared_by_scenarios_all_flew(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         capsys: pytest.CaptureFixture[str]) -> None:
     def flown(v_max: float, jerk: float) -> dict[str, float]:

@@ -104,7 +104,7 @@ def test_the_bounds_are_those_of_band_and_limits():
     assert 'not measured' in judged(synthetic(), {})[1]['cpu_cores.total']
 
 
-def test_commands_against_the_law_and_a_late_camera_fail_on_a_busy_machine_too():
+def test_commands_against_law_and_late_camera_fail_when_busy():
     flight = synthetic(along=0.04, estimate_ms=391.0, speed=0.3)
     summary = scenario_figures(flight, {'planner': 0.1}, {'planner': 0}, Load(0.5, 1.5, 2))
     verdicts = {j.bound.key: j.verdict for j in judge(scenario_bounds(flight, summary), summary,
@@ -115,7 +115,7 @@ def test_commands_against_the_law_and_a_late_camera_fail_on_a_busy_machine_too()
 
 
 @pytest.mark.parametrize(('speed', 'verdict'), [(0.5, 'ok'), (2.9, 'not judged'), (3.1, 'FAILED')])
-def test_late_setpoints_explain_the_speed_of_a_second_of_acceleration(speed, verdict):
+def test_late_setpoints_explain_speed_of_1_s_acceleration(speed, verdict):
     flight = synthetic(speed=speed)
     summary = scenario_figures(flight, {'planner': 0.1}, {'planner': 0})
     (found,) = (j for j in judge(scenario_bounds(flight, summary), summary, busy=True)
@@ -124,7 +124,7 @@ def test_late_setpoints_explain_the_speed_of_a_second_of_acceleration(speed, ver
 
 
 @pytest.mark.parametrize(('seconds', 'outrun'), [(0.9, False), (1.3, True)])
-def test_a_follower_that_is_outrun_must_warn_instead_of_holding_the_band(seconds, outrun):
+def test_outrun_follower_warns_instead_of_keeping_band(seconds, outrun):
     since = TIMES - 1.0
     speeds = np.where((since >= 0.0) & (since < seconds), 0.8, 0.3)  # a gust is shorter
     figures, faults = judged(synthetic(3.0, leader_speed=speeds))
@@ -206,7 +206,7 @@ def record(began, position, leader=(0.0, 0.0, 0.0)):
             'leader_position': np.tile(leader, (31, 1))})
 
 
-def test_distances_of_a_column_are_between_positions_in_one_frame():
+def test_column_distances_are_between_positions_in_one_frame():
     scenario = load('straight')  # they begin 1.5 m apart
     assert spacing(scenario) == 1.5
     summary = column_figures(scenario, {
@@ -257,7 +257,7 @@ def pretended(monkeypatch):
     return monkeypatch
 
 
-def test_each_follower_has_nodes_of_its_own_and_the_one_before_it_as_its_leader(
+def test_each_follower_has_own_nodes_and_leads_the_next(
         tmp_path, pretended):
     exit_codes = fly(load('straight'), 'straight', 7, 1.0, tmp_path, followers=2).exit_codes
     started, asked = Pretended.last.started, Pretended.last.asked
@@ -291,7 +291,7 @@ def test_each_follower_has_nodes_of_its_own_and_the_one_before_it_as_its_leader(
                                          'follower_2') == {'planner': 2}
 
 
-def test_a_flight_that_fails_ends_with_the_reason_and_nothing_runs_on(tmp_path, pretended):
+def test_failed_flight_ends_with_reason_and_no_process_left(tmp_path, pretended):
     pretended.setattr(Pretended, 'refusal', 'arm refused: compass')
     with pytest.raises(RuntimeError, match='^arm refused: compass$'):
         fly(load('hover'), 'hover', 0, 1.0, tmp_path)
@@ -319,7 +319,7 @@ def test_on_an_external_autopilot_it_takes_off_and_lands(tmp_path, pretended):
         'planner/engage', 'planner/engage', 'mavlink_bridge/offboard', 'mavlink_bridge/land']
 
 
-def test_a_flight_that_is_taken_from_the_bridge_ends_at_once_with_the_reason_and_lands(
+def test_flight_taken_from_bridge_ends_with_reason_and_lands(
         tmp_path, pretended, capsys):
     pretended.setattr(Pretended, 'bridge_says', ''.join(
         f'[INFO] [17.4] [mavlink_bridge]: state: {state}\n'
@@ -339,7 +339,7 @@ def test_a_flight_that_is_taken_from_the_bridge_ends_at_once_with_the_reason_and
      'INACTIVE: it has rebooted'),
     (['INACTIVE: offboard was not requested', 'ACTIVE', 'READY: giving back: land requested',
       'INACTIVE: given back (land requested)'], 'READY: giving back: land requested')])
-def test_the_bridge_ends_a_flight_with_its_first_state_after_active(states, ended):
+def test_bridge_ends_flight_with_first_state_after_active(states, ended):
     between = '[WARN] [17.5] [mavlink_bridge]: autopilot: state: unknown\n'
     assert ended_by_bridge(between.join(
         f'[INFO] [17.4] [mavlink_bridge]: state: {state}\n' for state in states)) == ended
@@ -355,7 +355,7 @@ def test_the_truth_comes_on_the_usual_link_of_each_simulator(autopilot, truth, e
     assert links(autopilot, truth, False)[:2] == expected
 
 
-def test_an_estimate_is_refused_as_truth_exactly_if_odometry_is_forwarded(tmp_path):
+def test_estimate_is_refused_as_truth_if_odometry_is_forwarded(tmp_path):
     for forward in (False, True):
         nodes = parameters_of_nodes(
             load('hover'), 'hover', 0, 4.0, tmp_path,
@@ -380,7 +380,7 @@ def test_an_estimate_is_refused_as_truth_exactly_if_odometry_is_forwarded(tmp_pa
      "connection = '5772': must be udpin:"),
     (['--autopilot', 'tcp:127.0.0.1:5760', '--truth', 'udp:127.0.0.1:14991', '--leader-truth',
       'udp:127.0.0.1:14991'], 'cannot listen there: Address already in use')])
-def test_a_flight_that_cannot_be_is_refused_before_anything_starts(
+def test_impossible_flight_is_refused_before_start(
         arguments, message, tmp_path, capsys):
     assert main([*arguments, '--output', str(tmp_path / 'out')]) == 1
     error = capsys.readouterr().err
@@ -403,7 +403,7 @@ def test_options_that_do_not_fit_are_refused(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_a_scenario_shorter_than_the_requested_duration_is_flown_to_its_end(
+def test_scenario_shorter_than_duration_is_flown_to_its_end(
         tmp_path, monkeypatch, capsys):
     flown = []
 

@@ -97,7 +97,7 @@ def test_drift_common_to_both_is_no_error() -> None:
     np.testing.assert_allclose(table['visible'], 1.0)
 
 
-def test_errors_as_large_as_the_covariances_say_have_a_nees_of_three() -> None:
+def test_errors_of_covariance_size_have_nees_of_three() -> None:
     table = collected(3000, noise=1.0, drift=0.4)
     assert np.mean(table['nees_position']) == pytest.approx(3.0, abs=0.15)
     assert np.mean(table['nees_velocity']) == pytest.approx(3.0, abs=0.15)
@@ -112,13 +112,13 @@ def test_a_wrong_attitude_is_an_angle() -> None:
 @pytest.mark.parametrize(('ahead', 'yaw', 'visible'), [
     ([2.0, 0.0, 0.0], 0.0, 1.0), ([2.0, 1.5, 0.0], 0.0, 0.0), ([-2.0, 0.0, 0.0], 0.0, 0.0),
     ([0.35, 0.0, 0.0], 0.0, 0.0), ([2.0, 0.0, 0.0], np.pi, 0.0)])
-def test_only_a_marker_whole_in_the_image_and_not_seen_from_behind_is_in_view(
+def test_only_whole_marker_seen_from_front_is_in_view(
         ahead: list[float], yaw: float, visible: float) -> None:
     table = collected(3, ahead=np.array(ahead), leader_yaw=yaw)
     np.testing.assert_array_equal(table['visible'], visible)
 
 
-def test_truth_is_interpolated_between_stamps_but_not_across_a_gap() -> None:
+def test_truth_is_interpolated_but_not_across_a_gap() -> None:
     errors = FrameErrors([LEADER], Transform(np.eye(3), np.zeros(3)), START)
     for stamp in (0, SECOND // 10, 2 * SECOND, 2 * SECOND + SECOND // 10):
         own = state(stamp, VELOCITY * stamp / SECOND)

@@ -150,7 +150,7 @@ def test_the_page_is_the_smallest_on_which_printers_print_all(
 
 
 @pytest.mark.ros
-def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_path: Path) -> None:
+def test_two_runs_write_same_bytes_with_any_matplotlib_setting(tmp_path: Path) -> None:
     first, second = tmp_path / 'a.pdf', tmp_path / 'b.pdf'
     assert main([*ISSUE, '--output', str(first)]) == 0
     rc = tmp_path / 'matplotlibrc'

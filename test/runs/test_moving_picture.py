@@ -25,7 +25,7 @@ Image = pytest.importorskip('PIL.Image')
 moving_picture = pytest.importorskip('flock_desk.runs.moving_picture').moving_picture
 
 
-def test_it_has_eight_pictures_each_second_also_without_an_estimate():
+def test_it_has_eight_pictures_a_second_without_estimate_too():
     times = np.arange(31) / 30
     estimated = np.where(times < 0.5, np.nan, 2.0)
     table = {'time': times, 'true_distance': np.full(31, 2.0), 'distance': estimated,

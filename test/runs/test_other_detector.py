@@ -137,7 +137,7 @@ def test_evaluate_judges_the_poses_of_another_detector(tmp_path: Path, more: str
     assert figures['track_share'] == 1.0
 
 
-def test_late_slow_poses_with_gaps_and_outliers_are_followed_within_the_limits(
+def test_late_slow_poses_with_outliers_are_followed_in_limits(
         tmp_path: Path) -> None:
     evaluation, figures = judged(tmp_path, Faults(3, 0.2, 0.05, 0.15))
     assert figures['track_share'] > 0.9 and figures['largest_m'] < 0.4

@@ -73,7 +73,7 @@ BUSY, QUIET = Load(0.5, 1.5, 2), Load(0.01, 0.1, 2)
 
 
 @pytest.mark.parametrize('error', [LateError('too late'), TimeoutError('too late')])
-def test_what_came_too_late_is_excused_by_a_load_and_by_nothing_else(error: Exception) -> None:
+def test_late_data_is_excused_by_load_alone(error: Exception) -> None:
     with pytest.raises(TooBusyError, match='^too late: for 50% of the worst 2 s'), explained(BUSY):
         raise error
     for load in (QUIET, None):  # unknown is not busy
@@ -133,7 +133,7 @@ class Starved:
 
 @pytest.mark.parametrize(('waited', 'code'), [
     (60.0, TOO_BUSY_EXIT_CODE), (0.0, -signal.SIGALRM)])
-def test_a_process_that_waited_for_a_processor_to_its_deadline_is_late_not_faulty(
+def test_process_that_waited_to_its_deadline_is_late_not_faulty(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waited: float, code: int) -> None:
     monkeypatch.setattr('flock_desk.runs.processes.longest_wait', lambda *_: waited)
     processes = Processes({}, tmp_path)

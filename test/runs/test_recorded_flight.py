@@ -59,7 +59,7 @@ def test_an_error_in_the_follower_is_no_fault_of_a_message(
         played(tmp_path, 0.1, lambda message: message)
 
 
-def test_where_odometry_stops_images_wait_then_drop_and_setpoints_end(tmp_path: Path) -> None:
+def test_images_wait_then_drop_when_odometry_stops(tmp_path: Path) -> None:
     flight = played(tmp_path, 4.0, stops(ODOM, 0.6))
     assert flight.rejections['odometry has not reached the image stamp'] + flight.rejections[
         'odometry lags behind the images'] > 90

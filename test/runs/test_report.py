@@ -94,7 +94,7 @@ def test_a_busy_machine_excuses_what_load_can_do_and_no_more(
         'ok' if figure is not None and figure <= 200.0 else 'FAILED')
 
 
-def test_the_verdict_of_a_busy_machine_is_a_code_and_the_last_line(
+def test_verdict_of_busy_machine_is_code_and_last_line(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     load, summary = Load(0.4, 1.2, 2), {'late': 300.0, 'far': 9.0}
     late, far = FigureBound('late', most=200.0, load=math.inf), FigureBound('far', most=2.0)
@@ -146,7 +146,7 @@ def test_bounds_stand_beside_their_figures_in_a_hundred_columns(
     assert announce(SUMMARY, judgments[:1], [], Path('logs')) == 0
 
 
-def test_the_page_names_figures_in_words_with_their_keys_and_warnings_first(
+def test_page_names_figures_with_keys_and_warnings_first(
         tmp_path: Path) -> None:
     write_report(tmp_path / 'report.html', 'A & B', '<p>', SUMMARY, judge(BOUNDS, SUMMARY),
                  warnings=['too fast & furious'])

@@ -84,7 +84,7 @@ def test_an_offset_of_the_neighbor_is_the_error() -> None:
     assert figures['nees_position'] == pytest.approx(25.0) and figures['nees_velocity'] is None
 
 
-def test_a_velocity_that_the_planner_refuses_counts_among_all_only() -> None:
+def test_velocity_refused_by_planner_counts_among_all_only() -> None:
     estimates = found(straight([2.0, 0.0, 0.0]))
     first = STAMPS[0]
     estimates[first] = found(straight([2.0, 0, 0])[:1], np.array([4.0, 0.0, 0.0]), 0.5)[first]
@@ -93,7 +93,7 @@ def test_a_velocity_that_the_planner_refuses_counts_among_all_only() -> None:
     assert figures['velocity_rms_of_all_m_s'] == pytest.approx(4.0 / np.sqrt(20))
 
 
-def test_a_missing_estimate_lowers_recall_only_where_the_leader_is_in_view() -> None:
+def test_missing_estimate_lowers_recall_only_in_view() -> None:
     some = found(straight([2.0, 0.0, 0.0])[::2])
     figures = sight_figures([table(some, [2.0, 0.0, 0.0])], 1.0)
     assert figures['recall'] == 0.5 and figures['position_rms_m'] == pytest.approx(0.0, abs=1e-9)

@@ -83,7 +83,7 @@ def test_a_reason_of_the_state_before_is_not_shown() -> None:
     assert (made.page(NOW)['state'], made.page(NOW)['reason']) == ('HOLD', '')
 
 
-def test_a_planner_that_is_silent_is_lost_whatever_its_latched_state() -> None:
+def test_silent_planner_is_lost_whatever_its_latched_state() -> None:
     made = flight()
     assert made.page(NOW + LIMITS['planner'])['state'] == 'TRACK'
     page = made.page(NOW + LIMITS['planner'] + 0.1)
@@ -158,7 +158,7 @@ def test_places_of_another_frame_are_forgotten() -> None:
     assert not made.take_odometry(state('base_link', stamp=2), NOW)  # of less use
 
 
-def test_what_is_drawn_into_an_image_is_its_own_estimate_else_carried_to_its_stamp() -> None:
+def test_image_shows_its_own_estimate_else_one_carried_to_it() -> None:
     made = ShownFlight()
     for k in range(3):
         made.take_neighbor(state(position=(2.0 + 0.1 * k, 0.0, 0.0), velocity=(1.0, 0.0, 0.0),
@@ -178,7 +178,7 @@ def test_from_above_a_shape_keeps_place_and_heading() -> None:
     assert box['p'] == [[1.0, 2.0]] and box['a'] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_the_shadow_of_an_ellipsoid_is_its_extent_along_the_ground() -> None:
+def test_ellipsoid_shadow_is_its_extent_along_ground() -> None:
     turn = quaternion_to_matrix(quaternion_from_rpy(0.4, -0.7, 1.1))
     outline = shadow(turn, (1.0, 2.0, 3.0))
     form = turn @ np.diag(np.square([0.5, 1.0, 1.5])) @ turn.T

@@ -39,7 +39,7 @@ def colored(jpeg: bytes) -> np.ndarray:
 
 @pytest.mark.parametrize(('camera', 'image'), [
     (CAMERA, GRAY), (WIDE, np.full((960, 1280), 100, np.uint8))])
-def test_a_box_is_drawn_where_the_camera_sees_it_at_any_size_of_image(
+def test_box_is_drawn_where_camera_sees_it_at_any_size(
         camera: CameraModel, image: np.ndarray) -> None:
     box = Shape('leader', BOX, 'seen', (0.4, 0.4, 0.4), (0.5, 0.25, 2.0))
     jpeg = draw_picture(image, camera, HERE, [box])
@@ -69,7 +69,7 @@ def test_text_from_the_wire_is_drawn_inside_the_image() -> None:
         assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0).max() > 170  # brighter than GRAY
 
 
-def test_an_image_of_another_size_than_the_calibration_is_refused() -> None:
+def test_image_of_other_size_than_calibration_is_refused() -> None:
     with pytest.raises(ValueError, match='camera_info is for 640x480'):
         draw_picture(np.zeros((10, 20), np.uint8), CAMERA, HERE, [])
 

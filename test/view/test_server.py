@@ -92,7 +92,7 @@ def control() -> Iterator[Rig]:
     made.server.stop()
 
 
-def test_every_file_is_served_with_a_policy_that_admits_no_other_script(rig: Rig) -> None:
+def test_every_file_is_served_with_policy_against_scripts(rig: Rig) -> None:
     assert {name for name, _ in FILES.values()} == {path.name for path in STATIC.iterdir()}
     for path, (name, kind) in FILES.items():
         status, headers, body = rig.get(path)
@@ -104,7 +104,7 @@ def test_every_file_is_served_with_a_policy_that_admits_no_other_script(rig: Rig
     assert rig.get('/../server.py')[0] == rig.get('/config')[0] == 404
 
 
-def test_the_page_has_no_script_of_its_own_and_never_takes_markup() -> None:
+def test_page_has_no_own_script_and_never_takes_markup() -> None:
     page = (STATIC / 'index.html').read_text()
     assert '<script>' not in page and ' style=' not in page and not re.search(r'\son\w+=', page)
     for name in ('app.js', 'draw.js'):
@@ -130,7 +130,7 @@ def test_a_socket_of_another_origin_is_refused(rig: Rig, origin: str) -> None:
     assert rig.server.pages == 0
 
 
-def test_a_token_in_the_address_becomes_a_cookie_and_a_wrong_one_is_refused(
+def test_token_in_address_becomes_cookie_wrong_one_is_refused(
         control: Rig) -> None:
     for path in ('/?token=wrong', '/app.js?token=wrong'):
         status, _, body = control.get(path)
@@ -197,7 +197,7 @@ def test_a_page_gets_the_history_first_then_states(rig: Rig) -> None:
     assert {'state': {'n': 3}} in rest and any('answer' in one for one in rest if one != b'jpeg')
 
 
-def test_a_page_that_reads_nothing_gets_the_newest_and_holds_up_no_other(rig: Rig) -> None:
+def test_page_that_does_not_read_delays_no_other(rig: Rig) -> None:
     big = b'x' * 200_000
 
     async def ask(session: aiohttp.ClientSession) -> list[int]:
@@ -237,7 +237,7 @@ def test_no_more_pages_than_the_limit_are_open(rig: Rig) -> None:
     assert rig.run(ask) == 503
 
 
-def test_a_busy_port_and_a_foreign_address_are_errors_with_the_remedy() -> None:
+def test_busy_port_and_foreign_address_are_errors_with_remedy() -> None:
     with socket.socket() as busy:
         busy.bind(('127.0.0.1', 0))
         busy.listen()
