@@ -84,7 +84,7 @@ def test_both_truths_are_enu_from_first_report(kind):
     assert (x, w) == (pytest.approx(math.sin(0.1)), pytest.approx(math.cos(0.1)))
 
 
-def test_a_place_told_in_steps_of_a_centimeter_moves_evenly_and_does_not_drift():
+def test_place_in_centimeter_steps_moves_evenly_without_drift():
     motion, steps = ExternalMotion(), []
     for k in range(400):
         motion.take(truth('HIL_STATE_QUATERNION', (0.006 * k, 0, 0), (0.3, 0, 0)), 20 * MS * k)
