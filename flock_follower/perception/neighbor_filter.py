@@ -298,8 +298,8 @@ class NeighborFilter:
         spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
         doubt = squared_distance(turn, spread) / GATE_CHI2
         # A marker's mirrored pose has its position right and its attitude wrong.
-        plausible = doubt <= 1.0 or (
-            doubt <= WILD_FACTOR and float(turn.dot(turn)) < MIN_MIRROR_ANGLE**2)
+        plausible = doubt <= 1.0 or (doubt <= WILD_FACTOR
+                                     and float(turn.dot(turn)) < MIN_MIRROR_ANGLE**2)
         if plausible:
             if self._surprises_again('attitude', turn, doubt):
                 prior = widened(prior, _TURNING, doubt)
