@@ -4,7 +4,7 @@
 #   make flights   fly every scenario 200 times in lock step, with five controllers (build/flights; many minutes)
 #   make figures   redraw the paper's simulations into build/figures, and the controllers that `make flights` compared
 # Change it
-#   make test      run the test suite (about nine minutes on two cores); exit code 3 if a machine that is too busy fails it
+#   make test      run the test suite (about eight minutes on two cores); exit code 3 if a machine that is too busy fails it
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style, types and names
