@@ -59,7 +59,7 @@ from flock_follower.messages import (
     with_acceleration,
 )
 from flock_follower.perception.neighbor_motion import Estimate
-from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
+from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver
 from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
@@ -279,7 +279,7 @@ class Follower:
         self.advance(time)
         if self.perceiver is not None and (
                 dropped := self.perceiver.take_image(message, stamp, self._seconds(), camera)):
-            self._listener.reject(LAGGING, '')
+            self._listener.reject(ODOMETRY_LAGS, '')
             self._listener.image(ImageOutcome(dropped.stamp_ns, camera=dropped.camera))
         self._process_due()
 

@@ -53,7 +53,7 @@ MOTION_TOPIC = 'mavlink/relative'
 #: s without a message in that frame after which odometry is used again.
 RELATIVE_SILENCE = 0.15
 #: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
-RELATIVE_MAX = 1.0
+RELATIVE_ACCELERATION_MAX = 1.0
 #: Oldest image that such a command may rest on, s.
 OLDEST_MARKER = 0.5
 #: Suffix of a neighbor's name on ``neighbors``: another object with the same marker. The planner

@@ -255,7 +255,7 @@ class World:
                         self._barometer.heights(vehicle.position[:, 2], now).tolist()))
 
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
-        """Let the vehicles fly accelerations (3,), and yaws where they are given, in a while."""
+        """Queue accelerations (3,), m/s^2, and yaws: a vehicle flies them after its delay."""
         self._coming.append((self.step, setpoints))
 
     def _take_setpoints(self, k: int) -> None:

@@ -139,7 +139,7 @@ class TooBusyError(Exception):
 
 @contextlib.contextmanager
 def explained(load: Load | None) -> Iterator[None]:
-    """Raise TooBusyError for what came too late inside the block, if the load was too high."""
+    """Turn a LateError or TimeoutError of the block into TooBusyError if the load was too high."""
     try:
         yield
     except (LateError, TimeoutError) as error:
@@ -319,8 +319,8 @@ class Processes:
         """
         Stop the children that still run.
 
-        :raises TooBusyError: for what came too late, if the machine was too busy.
-        :raises RuntimeError: if it came too late because a child was broken.
+        :raises TooBusyError: if a child came too late because the machine was too busy.
+        :raises RuntimeError: if a child came too late because it was broken.
         """
         self._left.set()
         fault = self.broken()

@@ -335,12 +335,12 @@ def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[Odometry
     """
     Return the table of ``frame_errors``.
 
-    The consistency of velocities is left unknown (NaN): the covariance in a message is of the
-    twist in the leader's body, and holds the error of the leader's attitude, too.
+    The consistency of velocities (error over covariance) is NaN: the covariance of a message is
+    that of the twist in the leader's body, and includes the error of the leader's attitude.
 
     :param stamps: (n,) of the images, ns.
     :param visible: (n,), see :func:`judged`.
-    :param start: the time of zero in the table, ns.
+    :param start: stamp of the time 0 of the table, ns.
     """
     errors = FrameErrors(
         [MarkedNeighbor(LEADER_NAME, ())], Transform(np.eye(3), np.zeros(3)), start)

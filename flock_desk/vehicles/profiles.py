@@ -124,9 +124,9 @@ class Profile:
 
     def version(self, name: str) -> str:
         """
-        Return a key of ``firmwares``, the first for ''.
+        Return ``name``, a key of ``firmwares``, or the first key if ``name`` is ''.
 
-        :raises ValueError: for another name.
+        :raises ValueError: if ``name`` is no key.
         """
         if name and name not in self.firmwares:
             raise ValueError(f'version = {name!r}: must be one of {", ".join(self.firmwares)}')

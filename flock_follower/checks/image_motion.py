@@ -63,7 +63,7 @@ MAX_OFFSET = 0.2
 #: Step of the time offsets that are tried, s.
 OFFSET_STEP = 0.01
 #: The 24 rotations that lay axes onto axes, the identity first.
-_QUARTER_TURNS = [matrix for p in permutations(range(3))
+_AXIS_ROTATIONS = [matrix for p in permutations(range(3))
                   for signs in product((1.0, -1.0), repeat=3)
                   if np.linalg.det(matrix := np.diag(signs)[list(p)]) > 0.0]
 
@@ -195,7 +195,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
         median[:, 2] >= MIN_RESPONSE]
     if len(rows) < MIN_PAIRS or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < MIN_SHIFT:
         return None
-    turns = np.array([turn for n, turn in enumerate(_QUARTER_TURNS)
+    turns = np.array([turn for n, turn in enumerate(_AXIS_ROTATIONS)
                       if n == 0 or up is None or turn[2].dot(up) > 0.5])
     to_optical = turns.transpose(0, 2, 1) @ R_base_optical
     offsets = np.arange(-MAX_OFFSET, MAX_OFFSET + 1e-9, OFFSET_STEP)

@@ -52,7 +52,7 @@ from flock_follower.gate.velocity_check import (
     Velocity,
 )
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX, SANE
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_ACCELERATION_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
     INSIDE_SHARE,
@@ -211,7 +211,7 @@ def _relative(full: GateLimits, command: Command, offset: Array, place: Location
     Heights go first, then the limit of the acceleration; the speed is not known.
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE)
-    strongest = RELATIVE_MAX * SENT_INSIDE
+    strongest = RELATIVE_ACCELERATION_MAX * SENT_INSIDE
     margin = min(HEIGHT_MARGIN, 0.25 * (full.height_max - full.height_min))
     height, climb, horizon = place.height, place.climb_rate, full.speed_horizon
     assert height is not None  # else it is refused

@@ -65,7 +65,7 @@ from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.parameter_table import RELATIVE_POSE as SPECS
 from flock_follower.perception.parameter_table import tracker
-from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
+from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver, Processed
 from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
@@ -215,7 +215,7 @@ class RelativePose(FlockNode):
         stamp = read_stamp(message.header.stamp)
         dropped = self._perceiver.take_image(message, stamp, time.monotonic(), camera.name)
         if dropped is not None:
-            self._cameras[dropped.camera].reject(LAGGING)
+            self._cameras[dropped.camera].reject(ODOMETRY_LAGS)
         self._process_pending()
 
     def _take_range(self, message: Range) -> None:

@@ -357,7 +357,7 @@ class View(FlockNode):
 
 
 def _access(values: dict[str, Any]) -> Access:
-    """Return the rules of the page, with a token of this start if one is needed."""
+    """Return who may access the page, with a new token for this run if one is needed."""
     host, control = values['host'], values['control']
     needed = control or not is_loopback(host)
     names: set[str] = set()

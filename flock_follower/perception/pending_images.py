@@ -49,7 +49,7 @@ from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseS
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
 #: Odometry is late after this factor times the longest observed wait, plus a margin.
 LATE_FACTOR = 1.5
-LAGGING = 'odometry lags behind the images'
+ODOMETRY_LAGS = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
 UNKNOWN_ATTITUDE = 10.0  # rad^2, variance of an attitude of which nothing is known

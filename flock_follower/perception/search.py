@@ -63,7 +63,7 @@ _HALVED = (15, 1)
 N_PORTIONS = 2 + len(_SEARCH_WINDOWS)
 _DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
-_ROUNDEST = 32.0  # squared length over area; of a square 16
+_MAX_ELONGATION = 32.0  # squared length over area; of a square 16
 _STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are none
 _HIDDEN = 0.35  # share of the visible area that a reflex may have hidden
 _SLIGHT = 0.05  # share of that: no reflex, but a blunt corner
@@ -243,7 +243,7 @@ def quadrilaterals(logarithm: GrayImage,
                 continue
             hull = cv2.convexHull(contour)
             length, area = cv2.arcLength(hull, True), cv2.contourArea(hull)
-            if _SHORTEST < length < math.sqrt(_ROUNDEST * area):
+            if _SHORTEST < length < math.sqrt(_MAX_ELONGATION * area):
                 outline = cv2.approxPolyDP(hull, _STRAIGHT * length, True)
                 if len(outline) > _MOST_CORNERS:
                     continue

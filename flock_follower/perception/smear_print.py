@@ -60,7 +60,7 @@ LENS_BLURS = np.array([0.07, 0.11, 0.17, 0.27, 0.4])
 #: Number of the first of these that are in focus.
 N_FOCUSED = 3
 #: Index of the lens that is assumed first.
-_FIRST_LENS = 1
+_ASSUMED_LENS = 1
 #: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees. None is 0,
 #: where the squares have no slope by the vector and the descent stays.
 _LENGTHS = (0.2, 0.5, 1.0, 1.45)
@@ -110,7 +110,7 @@ class SmearModel:
         self.smears = np.array([*(length * np.array([np.cos(a), np.sin(a)])
                                   for length in _LENGTHS for a in angles),
                                 *np.zeros((len(LENS_BLURS) - N_FOCUSED, 2))])
-        self.lenses = (_FIRST_LENS,) * (len(_LENGTHS) * len(angles)) + tuple(
+        self.lenses = (_ASSUMED_LENS,) * (len(_LENGTHS) * len(angles)) + tuple(
             range(N_FOCUSED, len(LENS_BLURS)))
         self.smeared: Any = np.array([
             smear_print(self.printed[lens], self.texels, smear, LENS_BLURS[lens])[0][0]

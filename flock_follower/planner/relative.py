@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
-from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.planner.inputs import (
     find_newest,
     Neighbor,
@@ -52,7 +52,7 @@ from flock_follower.planner.scene import Decision
 from flock_follower.planner.vertical_yaw import Altitude, face_yaw, turn_rate
 
 #: Largest vertical acceleration, m/s^2, besides the offset of the disturbance: the altitude
-#: leaves the rest of ``RELATIVE_MAX`` to the distance.
+#: leaves the rest of ``RELATIVE_ACCELERATION_MAX`` to the distance.
 VERTICAL_MAX = 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
@@ -192,8 +192,8 @@ def limit_relative(horizontal: Array, vertical: float, last: Array | None) -> Ar
 
     :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
     """
-    up = min(max(vertical, -RELATIVE_MAX), RELATIVE_MAX)
-    flat = limit_norm(horizontal, math.sqrt(RELATIVE_MAX ** 2 - up * up))
+    up = min(max(vertical, -RELATIVE_ACCELERATION_MAX), RELATIVE_ACCELERATION_MAX)
+    flat = limit_norm(horizontal, math.sqrt(RELATIVE_ACCELERATION_MAX ** 2 - up * up))
     return without_step(np.array([*flat, up]), last)
 
 

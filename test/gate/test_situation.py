@@ -35,7 +35,7 @@ from flock_follower.gate.velocity_check import (
     ODOM,
     SourceMotion,
 )
-from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 
 ANY = st.floats() | st.floats(-4.0, 4.0)
 VECTOR = st.tuples(ANY, ANY, ANY)
@@ -113,7 +113,7 @@ def test_any_situation_sends_nothing_unsafe_unpermitted_or_stale(given):
         if given.command.command.relative:
             assert limits.relative_flight and fresh(given.source_age, OLDEST_MARKER)
             assert np.linalg.norm(setpoint.acceleration[:2]) <= (
-                RELATIVE_MAX + np.linalg.norm(given.offset[:2]))
+                RELATIVE_ACCELERATION_MAX + np.linalg.norm(given.offset[:2]))
         else:
             assert given.known.velocity is not None and given.known.contradiction is None
 

@@ -22,7 +22,12 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.messages import OdometryChoice, OdometryState, RELATIVE, RELATIVE_MAX
+from flock_follower.messages import (
+    OdometryChoice,
+    OdometryState,
+    RELATIVE,
+    RELATIVE_ACCELERATION_MAX,
+)
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
@@ -114,7 +119,7 @@ def test_a_leader_that_stops_is_not_run_into():
 def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     before = np.zeros(3) if last is None else np.array(last)
     command = limit_relative(np.array(level), vertical, last if last is None else before)
-    assert np.linalg.norm(command) <= RELATIVE_MAX + 1e-9
+    assert np.linalg.norm(command) <= RELATIVE_ACCELERATION_MAX + 1e-9
     assert np.linalg.norm(command - before) <= STEP_MAX + 1e-9
 
 
