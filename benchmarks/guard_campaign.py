@@ -188,7 +188,7 @@ def fly_part(cell: Cell, runs: Sequence[int]) -> Iterator[dict[str, Any]]:
             name: round(float(values[k]), 4) for name, values in measures.items()
             if name in ('min_separation', 'max_separation', 'out_of_band', 'in_band',
                         'horizontal_jerk', 'lost')},
-            'fronts': fronts(flights, k) if cell.name.startswith('column') else []}
+               'fronts': fronts(flights, k) if cell.name.startswith('column') else []}
 
 
 def fronts(flights: Flights, run: int) -> list[float]:

@@ -100,7 +100,7 @@ def _demonstrate(out: Path) -> int:
             flight = read_replayed(BAG, out, params)
         summary = replay_figures(flight, exit_codes, load)
         judgments = report(out, TITLE, INTRODUCTION, summary, demo_bounds(params),
-                            chapters(flight), load=load)
+                           chapters(flight), load=load)
         print()
         return announce(summary, judgments, [out / 'report.html'], out, load)
 

@@ -112,9 +112,9 @@ def _stop(values: Mapping[str, Any]) -> Iterator[Judgment]:
     if v_max > STOP_TIME * left_for_motion(a_max):
         least = math.hypot(v_max / STOP_TIME, THRUST_OFFSET_MAX)
         yield Judgment(True, 'a_max', a_max, f'at least {math.ceil(100.0 * least) / 100.0:g} '
-                        f'm/s^2 for v_max = {v_max:g}',
-                        f'it stops within {STOP_TIME:g} s, and a wrong hover thrust takes '
-                        f'{THRUST_OFFSET_MAX:g} m/s^2 of it')
+                       f'm/s^2 for v_max = {v_max:g}',
+                       f'it stops within {STOP_TIME:g} s, and a wrong hover thrust takes '
+                       f'{THRUST_OFFSET_MAX:g} m/s^2 of it')
 
 
 def _band(values: Mapping[str, Any]) -> Iterator[Judgment]:
@@ -123,15 +123,15 @@ def _band(values: Mapping[str, Any]) -> Iterator[Judgment]:
     near, far = (math.sqrt(float(values[name])) for name in ('d0', 'd1'))
     if near < NEAREST:
         yield Judgment(True, 'd0', values['d0'], f'at least {NEAREST ** 2:g} m^2',
-                        f'the band begins {near:.2f} m from the hull of the neighbor')
+                       f'the band begins {near:.2f} m from the hull of the neighbor')
     least = f'at least {math.ceil(100.0 * (near + NARROWEST) ** 2) / 100.0:g} m^2'
     if far - near < NARROWEST:
         yield Judgment(True, 'd1', values['d1'], f'{least} for d0 = {values["d0"]:g}',
-                        f'a band of {far - near:.2f} m is as wide as the errors')
+                       f'a band of {far - near:.2f} m is as wide as the errors')
     elif far - near < NARROW:
         wide = math.ceil(100.0 * (near + NARROW) ** 2) / 100.0
         yield Judgment(False, 'd1', values['d1'], f'at least {wide:g} m^2',
-                        f'a leader that reverses leaves a band of {far - near:.2f} m')
+                       f'a leader that reverses leaves a band of {far - near:.2f} m')
 
 
 def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgment]:
@@ -141,8 +141,8 @@ def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgment]:
         if far > range_max:
             most = max(range_max - float(values.get('radius', 0.0)), 0.0)
             yield Judgment(True, 'd1', values['d1'],
-                            f'at most {math.floor(100.0 * most ** 2) / 100.0:g} m^2',
-                            f'the marker is not found beyond {range_max:.1f} m')
+                           f'at most {math.floor(100.0 * most ** 2) / 100.0:g} m^2',
+                           f'the marker is not found beyond {range_max:.1f} m')
     if camera.rate is not None and camera.rate > 0.0:
         least = LOST_IMAGES / camera.rate
         for name, dangerous, why in (
@@ -162,12 +162,12 @@ def _height(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgment]:
     most = middle * min(STEEPEST, view)
     if abs(float(values['altitude_offset'])) > most:
         yield Judgment(True, 'altitude_offset', values['altitude_offset'],
-                        f'within {math.floor(100.0 * most) / 100.0:g} m',
-                        'the neighbor leaves the image above or below and comes near unseen')
+                       f'within {math.floor(100.0 * most) / 100.0:g} m',
+                       'the neighbor leaves the image above or below and comes near unseen')
 
 
 def _hidden(values: Mapping[str, Any]) -> Iterator[Judgment]:
     assumed = float(values.get('leader_acceleration_max', 0.0))
     if assumed > RESTLESS:
         yield Judgment(False, 'leader_acceleration_max', assumed, f'at most {RESTLESS:g} m/s^2',
-                        'it retreats at every short loss of sight')
+                       'it retreats at every short loss of sight')

@@ -215,7 +215,7 @@ def _at(states: array[float], stamps: Array) -> _States:
         state = _sample(rows[before[k]], begin)
         if before[k] != after[k]:
             state = interpolate(state, _sample(rows[after[k]], begin),
-                            float(stamps[k] - begin) / NANOSECONDS)
+                                float(stamps[k] - begin) / NANOSECONDS)
         result.position[k], result.velocity[k] = state.position, state.velocity
         result.rotation[k] = quaternion_to_matrix(state.quaternion)
     return result

@@ -65,7 +65,7 @@ class Finding(NamedTuple):
 
 
 def grade(bad: bool, poor: bool, what: str, measured: str, wanted: str,
-           advice: str) -> Finding:
+          advice: str) -> Finding:
     """Return an error if ``bad``, a warning if only ``poor``, else OK without the advice."""
     if bad or poor:
         return Finding(ERROR if bad else WARNING, what, measured, wanted, advice)

@@ -64,8 +64,8 @@ MAX_OFFSET = 0.2
 OFFSET_STEP = 0.01
 #: The 24 rotations that lay axes onto axes, the identity first.
 _AXIS_ROTATIONS = [matrix for p in permutations(range(3))
-                  for signs in product((1.0, -1.0), repeat=3)
-                  if np.linalg.det(matrix := np.diag(signs)[list(p)]) > 0.0]
+                   for signs in product((1.0, -1.0), repeat=3)
+                   if np.linalg.det(matrix := np.diag(signs)[list(p)]) > 0.0]
 
 #: Prior deviations of the mounting, rad, of the ratio of the shifts, and of 1 / depth of each
 #: part, 1/m.

@@ -107,9 +107,9 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     count = motion.lost + len(motion.states)
     if motion.lost:
         yield grade(motion.lost > LOST * count, True, 'odom',
-                     f'{motion.lost} of {count} are invalid: {motion.last_error}',
-                     'position and attitude', 'wait until its source is initialized; more '
-                     'texture, light; rtabmap: publish_null_when_lost:=false')
+                    f'{motion.lost} of {count} are invalid: {motion.last_error}',
+                    'position and attitude', 'wait until its source is initialized; more '
+                    'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
         return
     yield from _parameters_alike(seen)

@@ -79,8 +79,8 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
     load, wanted = machine.load, f'at most {BUSY_SHARE:.0%}, never {STARVED_SHARE:.0%}'
     if load is not None:
         yield grade(load.share > STARVED_SHARE, load.busy, 'processor', str(load), wanted,
-                     'end programs that are not needed (rviz, recordings), or reduce the load of '
-                     'the odometry')
+                    'end programs that are not needed (rviz, recordings), or reduce the load of '
+                    'the odometry')
     elif seen.live:
         yield Finding(UNMEASURED, 'processor', 'our nodes do not run on this computer, or its '
                       'kernel does not count for how long they wait', wanted)
@@ -122,7 +122,7 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
         advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
         found = [grade(status.level > 1, status.level == 1, f'{node} status', status.message,
-                        'running', advice)]
+                       'running', advice)]
         if node == 'mavlink_bridge':
             found += _autopilot(status.values)
         # Faults at the time of a recording do not prevent its use.
@@ -173,6 +173,6 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
              'offboard')):
         if key in values:
             yield grade(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
-                         wanted, wanted, advice)
+                        wanted, wanted, advice)
         elif key == REFUSED or not read_flag(values, ARMED):
             yield Finding(UNMEASURED, what, 'not reported yet', wanted)

@@ -306,7 +306,7 @@ class Gate:
         self._notice_landing(now)
         # In flight only a lasting landed report counts: a false one must not remove thrust.
         report = VehicleReport(flight.is_armed, flight.airborne is True or flight.was_active,
-                        link_age, mode_age)
+                               link_age, mode_age)
         active = self.permission.phase is Phase.ACTIVE
         flight.active_since = onset(flight.active_since, active, now)
         withheld = withheld or self.withheld

@@ -414,7 +414,7 @@ class Source:
 
 
 def find_displacement(odom: Source, autopilot: Source | None, turn: float, height: Path,
-              now: float) -> Refusal | None:
+                      now: float) -> Refusal | None:
     """
     Return that the displacements of odometry and of another source differ, or None.
 

@@ -103,7 +103,7 @@ def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
 
 
 def velocity_fault(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
-               now: float) -> str:
+                   now: float) -> str:
     """
     Return why the autopilot's velocity is invalid at ``now``, s, or ''.
 

@@ -220,7 +220,7 @@ class Requests:
         reasons += [self._housekeeping.watch.obstacle(), self._end.battery_low(now),
                     self._housekeeping.origin.obstacle,
                     find_misplacement(telemetry.local_place(now), telemetry.home(),
-                              gate.odometry_position)]
+                                      gate.odometry_position)]
         if self._require_failsafe:
             reasons.append(parameter_check.obstacle(
                 dialect, self._housekeeping.parameters, self._housekeeping.without_gps))

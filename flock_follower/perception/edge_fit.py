@@ -331,7 +331,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
 
 
 def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
-            spacing: tuple[float, float], blur: list[float]) -> EdgeFit | None:
+               spacing: tuple[float, float], blur: list[float]) -> EdgeFit | None:
     """Return the fit that ends with a step, None if it is poor or leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_MIN_AXIS_SHARE * lines.model.counts).all():
         return None

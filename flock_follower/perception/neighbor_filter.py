@@ -285,7 +285,7 @@ class NeighborFilter:
                                  covariance[:n, :n] + before[1][:n, :n])
 
     def _compare(self, expected: Estimate, T_odom_body: Transform, reference: Array,
-                  covariance: Array) -> tuple[Array, bool, Array, Array, Array]:
+                 covariance: Array) -> tuple[Array, bool, Array, Array, Array]:
         """
         Compare a measurement with the expected state, the attitude first.
 

@@ -321,7 +321,7 @@ def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int)
 
 
 def _linearize(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
-                response: list[float] | None) -> _Linear | None:
+               response: list[float] | None) -> _Linear | None:
     """
     Return the print near ``start``; None if the image does not show it.
 

@@ -158,7 +158,7 @@ def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> l
 
 
 def lost_leader(memory: Memory, neighbors: Neighborhood, me: OwnState,
-                  params: PlannerParams) -> Neighbor | None:
+                params: PlannerParams) -> Neighbor | None:
     """
     Return the last estimate of a lost leader to search for, at most ``resume_timeout`` old.
 

@@ -48,7 +48,7 @@ Change = Callable[[Any, int], Any]
 
 def levels(change: Change = lambda message, k: message, latency: float = 0.03,
            pose: Transform = IN_CAMERA, frames_topic: str = '') -> tuple[Observations,
-                                                                        dict[str, str]]:
+                                                                         dict[str, str]]:
     """Return the observations of a hovering pair, and the level of each row."""
     random = np.random.default_rng(2)
     seen = Observations(live=False, names=names_there('', {}), topics={

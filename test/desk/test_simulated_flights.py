@@ -173,7 +173,7 @@ def test_lost_odometry_is_braked_on_within_300_ms() -> None:
 @pytest.mark.parametrize(('descent', 'v_max'), [
     (1.0, 2.0), pytest.param(0.3, 0.5, marks=pytest.mark.sweep)])
 def test_behind_landing_leader_it_stops_at_altitude_min(descent: float,
-                                                                   v_max: float) -> None:
+                                                        v_max: float) -> None:
     indoor = load('indoor')
     landing = replace(
         indoor, duration=17.0, flight=replace(indoor.flight, altitude_min=1.0, v_max=v_max),

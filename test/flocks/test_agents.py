@@ -113,7 +113,7 @@ FAR = np.array([[0.0, 0.0], [1.2, 0.0], [9.0, 0.0]])
     (LEADERLESS_START.positions[0], 'flocking', r'^positions has shape \(2,\): must be'),
     (0.5 * LEADERLESS_START.positions, 'cucker_dong',
      r'^two agents start 0\.62\d* m apart: must be more'
-                                                r' than sqrt\(d0\) = 1 m$'),
+     r' than sqrt\(d0\) = 1 m$'),
     (FAR, 'flocking', r'^two agents start 9 m apart: must be less than sqrt\(d1\) = 1\.5 m'),
     (FAR, 'boids', r"^model = 'boids': must be one of flocking, cucker_dong, cucker_smale")])
 def test_bad_input_is_refused_with_what_to_change(positions: Any, model: Any,

@@ -55,7 +55,7 @@ def test_the_complete_graph_is_the_papers_law() -> None:
     (2.9, 0.3 * np.sqrt(2.0) * np.sqrt(2.9) / 1.9 ** 2),  # whole up to d0 + 0.28 (d1 - d0)
     (8.0, 0.0)])
 def test_agents_without_edge_only_separate_within_band(r2: float,
-                                                                      push: float) -> None:
+                                                       push: float) -> None:
     v = np.array([[0.0, 0.3], [0.0, -0.3]])
     u = laws.graph_accelerations(two(r2), v, FLIGHT_PARAMS, NONE, ALL[:1])
     assert u == pytest.approx(np.array([[-push, 0.0], [push, 0.0]]))
@@ -101,7 +101,7 @@ def test_random_flocks_stay_apart_and_keep_every_edge(agents: int, dimension: in
     (1.6, True, True), (1.4, True, False), (7.4, True, True), (7.6, True, False),
     (1.6, False, True), (1.4, False, False), (9.0, False, True)])
 def test_step_is_small_up_to_half_way_to_band_edge(r2: float, joined: bool,
-                                                                   small: bool) -> None:
+                                                   small: bool) -> None:
     before = two(2.0 if r2 < 4.0 else 7.0)  # gaps of 1 m^2
     assert laws.step_is_small(before, two(r2), FLIGHT_PARAMS, ALL[:1] if joined else NONE,
                               ALL[:1]) is small

@@ -214,7 +214,7 @@ def test_displacement_mismatch_beyond_deviation_is_reported(
     odom.path, autopilot.path = paths(4.0, lambda t: drift * t / 4.0 * np.eye(3)[axis], still)
     odom.std = std
     why = find_displacement(odom, None if height else autopilot, 0.0,
-                    autopilot.path if height else Path(), 4.0)
+                            autopilot.path if height else Path(), 4.0)
     assert bool(why) == contradicts
     assert not why or ('barometer' in why.detail) == height
 

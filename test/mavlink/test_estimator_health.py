@@ -124,5 +124,5 @@ def test_a_fix_is_lost_since_the_first_message_without_it():
     ((math.nan, 0, 0), None, None, 'steps of 0.5 m')])
 def test_an_estimate_in_another_place_is_found(position, home, odometry, reason):
     found = find_misplacement(*(None if each is None else np.array(each, dtype=float)
-                        for each in (position, home, odometry)))
+                                for each in (position, home, odometry)))
     assert (reason in found) and bool(found) == bool(reason)

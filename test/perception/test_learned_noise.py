@@ -71,8 +71,8 @@ def test_noise_share_of_pose_variance_is_learned_to_a_limit(
     seen = []
     for k in range(8 * LEARNED):
         learned.take(rng.normal(0.0, 0.01 * np.sqrt(2.0 * white), 6),
-                    2.0 * (np.diag(np.repeat(learned.scales, 3) * 0.01)**2
-                           + learned.covariance(SIGHT)), SIGHT)
+                     2.0 * (np.diag(np.repeat(learned.scales, 3) * 0.01)**2
+                            + learned.covariance(SIGHT)), SIGHT)
         if k > 4 * LEARNED:
             seen.append([*learned.shares])
     np.testing.assert_allclose(np.mean(seen, axis=0), shares, rtol=0.15)

@@ -87,7 +87,7 @@ class Flight:
 
 @pytest.mark.parametrize(('light', 'gamma'), [(0.1, 2.2), (0.3, 1.0)])
 def test_hard_shadow_edge_across_marker_costs_nothing(light: float,
-                                                                   gamma: float) -> None:
+                                                      gamma: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
         shade = 0.07 * k + 1.0, 0.55 * np.sin(k / 7.0), light
         return world.image([pose], k, shade=shade, gamma=gamma)

@@ -416,7 +416,7 @@ def draw_state(rng: np.random.Generator, now: float) -> tuple[float, Array, Arra
 @given(st.integers(0, 2 ** 32), st.integers(1, 8), st.sampled_from(ALTITUDE_MODES))
 @pytest.mark.filterwarnings('ignore:overflow')
 def test_no_command_is_stale_or_beyond_limits(seed: int, count: int,
-                                                                  altitude_mode: str) -> None:
+                                              altitude_mode: str) -> None:
     """Whatever comes, of neighbors of any kind."""
     rng = np.random.default_rng(seed)
     roles = {f'n{k}': Member(str(rng.choice(ROLES)), float(rng.choice([0.0, 0.3, 1.5])))

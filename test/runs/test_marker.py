@@ -163,7 +163,7 @@ def test_two_runs_write_same_bytes_with_any_matplotlib_setting(tmp_path: Path) -
 
 
 def test_what_it_prints_is_a_neighbors_file(tmp_path: Path,
-                                             capsys: pytest.CaptureFixture[str]) -> None:
+                                            capsys: pytest.CaptureFixture[str]) -> None:
     main(['--id', '7', '--dictionary', 'DICT_6X6_250', '--size', '0.123', '--output',
           str(tmp_path / 'm.pdf')])
     document = yaml.safe_load(capsys.readouterr().out)

@@ -135,7 +135,7 @@ def test_bounds_stand_beside_their_figures_in_a_hundred_columns(
     assert 'bag' not in shown and 'odometry comes late' in shown  # the bag is no figure
     assert re.search(r'planner.missed_ticks +0 +≤ 3 +ok', shown)
     judgments = judge([FigureBound('setpoints.reasons.no command', most=2),
-                        FigureBound('nowhere', most=2)], SUMMARY)
+                       FigureBound('nowhere', most=2)], SUMMARY)
     assert announce(SUMMARY, judgments, [Path('out/report.html')], Path('logs')) == 1
     out, errors = capsys.readouterr()
     assert 'setpoints.reasons.no command' in out and 'nowhere' in out

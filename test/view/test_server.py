@@ -205,7 +205,7 @@ def test_page_that_does_not_read_delays_no_other(rig: Rig) -> None:
         async with session.ws_connect(f'{rig.origin}/ws', headers=headers) as quick:
             # One that shakes hands and reads no more.
             _, writer = await asyncio.open_connection('127.0.0.1', rig.server.port,
-                                                           limit=1024)
+                                                      limit=1024)
             writer.transport.pause_reading()  # type: ignore[attr-defined]
             writer.write((f'GET /ws HTTP/1.1\r\nHost: {rig.host}\r\nOrigin: {rig.origin}\r\n'
                           'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13'
