@@ -33,6 +33,7 @@ from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import T_BODY_OPTICAL
 from flock_desk.closed_loop.flown import EmbeddedVehicle
 from flock_desk.closed_loop.real_time_flight import (
+    body_pose,
     calibration,
     RealTimeFlight,
     RenderedImage,
@@ -53,6 +54,7 @@ from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.messages import from_odometry, Make, NANOSECONDS, odometry
 from flock_follower.neighbors_file import parse
 from flock_follower.perception.neighbor_motion import FilterParams
+from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.tracker import Tracker
 from flock_follower.planner.loop import PlannerLoop
@@ -63,7 +65,6 @@ from flock_follower.ranges import parameter, Range
 LEADER = 'leader'
 EPOCH_NS = 1_700_000_000 * NANOSECONDS  # stamp of time zero
 CAMERA_FRAME = 'camera_optical_frame'
-POSES_WAIT = 0.35  # s: relative_pose's max_wait by default
 REPORT_STEPS = 5  # of the autopilot, between two reports of velocity, attitude and height
 STATUS_STEPS = 50  # of the autopilot, between two reports of its mode
 REQUEST_TIME = 1.0  # s: offboard and engage are called then
@@ -135,7 +136,7 @@ class DetectorFlight(Listener):
             T_BODY_OPTICAL, params)
         self._follower = Follower(
             PlannerLoop(), scenario.flight.planner(True), gate, self, make,
-            perceiver=Perceiver(tracker, max_wait=POSES_WAIT))
+            perceiver=Perceiver(tracker, max_wait=MAX_WAIT))
         self._coming: list[tuple[float, int, PoseState | None]] = []
         """Results under way: when each arrives, s, the stamp of its image, ns, and the pose."""
         self._steps = 0
@@ -232,7 +233,7 @@ class DetectorFlight(Listener):
             error = deviations * found
             if odd < detector.outliers:
                 error[:3] += detector.outlier * away / np.linalg.norm(away)
-            true = (_pose(image.follower) @ T_BODY_OPTICAL).inverse() @ _pose(leader)
+            true = (body_pose(image.follower) @ T_BODY_OPTICAL).inverse() @ body_pose(leader)
             pose = from_pose(pose_with_covariance(
                 self._make, EPOCH_NS + image.stamp_ns, CAMERA_FRAME,
                 Transform(rotation_vector_to_matrix(error[3:]) @ true.rotation,
@@ -266,7 +267,3 @@ class DetectorFlight(Listener):
 
     def reject(self, reason: str, detail: str) -> None:
         self._reasons[reason] += 1
-
-
-def _pose(state: Odometry) -> Transform:
-    return Transform(quaternion_to_matrix(state.quaternion), state.position)

@@ -170,15 +170,17 @@ class RealTimeFlight:
         """Return the pixels of an image, with the leader if it is not hidden."""
         moments = [round(1e9 * t) for t in CAMERA_SENSOR.times(stamp_ns * 1e-9)]
         motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
-        leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
+        leaders = [] if hidden else [body_pose(motion) for motion in motions if motion is not None]
         return camera.image(
-            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders)
+            self._images, [body_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments],
+            leaders)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE_START if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
 
 
-def _pose(state: Odometry) -> Transform:
+def body_pose(state: Odometry) -> Transform:
+    """Return the pose of the body in the odometry's frame."""
     return Transform(quaternion_to_matrix(state.quaternion), state.position)
 
 

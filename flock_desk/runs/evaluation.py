@@ -66,7 +66,6 @@ from flock_follower.neighbors_file import load, NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.parameters.spec import filled
-from flock_follower.perception.images import DecodedImage
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
@@ -186,8 +185,6 @@ class Evaluation(Listener):
             for camera in cameras(perception)}, bag.start_ns)
         self.wall_time = 0.0
         self.cpu: defaultdict[str, list[float]] = defaultdict(list)
-        self._decoding: dict[tuple[str, int], float] = {}
-        """CPU time of images decoded ahead, s, by camera and stamp, ns."""
         self.frames = 0
         self.tick_rows: list[tuple[float, ...]] = []
         self.setpoint_rows: list[tuple[float, ...]] = []
@@ -276,8 +273,6 @@ class Evaluation(Listener):
         elif name == POSES:
             self.follower.pose(time, camera, pose)
         elif name == RAW_IMAGES:
-            if isinstance(message, DecodedImage):
-                self._decoding[camera, stamp] = message.spent
             self.follower.image(time, message, stamp, camera)
 
     def _is_new(self, camera: str, data: bytes) -> bool:
@@ -326,8 +321,7 @@ class Evaluation(Listener):
         if seen is None:
             self.errors.frame(stamp, {}, {}, camera)
         else:
-            ahead = self._decoding.pop((camera, outcome.stamp), 0.0)
-            self.cpu['decode'].append(ahead + outcome.decoding)
+            self.cpu['decode'].append(outcome.decoding)
             self.cpu[seen.stage].append(outcome.perception)
             self.errors.frame(stamp, seen.estimates, seen.stages, camera)
 

@@ -30,6 +30,7 @@ from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.neighbor_filter import UpdateOutcome
+from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import LATE_POSE, MANY_OUTLIERS, Sourced
 from flock_follower.perception.tracker import Tracker
@@ -40,7 +41,6 @@ MOST_REFUSED: Final = 0.5  # share of refused poses from which on there is an er
 MAX_LATENCY: Final = 0.4  # s: a larger median is an error
 MIN_RATE: Final = 7.0  # Hz, of a neighbor in sight; slower poses were not flown
 MOST_JUDGED: Final = 600  # poses of a neighbor: each takes about a millisecond
-MAX_WAIT: Final = 0.35  # s: the longest wait of a pose for odometry
 MIN_COS_SIGHT: Final = 0.26  # cosine of the angle, 75 degrees, from the optical axis
 MIN_COS_TILT: Final = 0.7  # cosine of the angle, 45 degrees, of a body from the vertical
 MIN_USED: Final = 10  # poses: of fewer, outliers and axes are not judged

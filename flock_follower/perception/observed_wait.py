@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections import deque
 
 LATE_MARGIN = 0.03  # s
+MAX_WAIT = 0.35  # s: the parameter max_wait by default
 N_OBSERVED = 50  # newest waits that count
 
 

@@ -27,6 +27,7 @@ from flock_follower.parameters.cameras import CAMERA_SPECS, cameras, DEFAULT_POS
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.perception.markers import load
 from flock_follower.perception.neighbor_filter import FilterParams
+from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.range_tracking import RangingParams
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
@@ -58,7 +59,7 @@ RELATIVE_POSE = [
     Spec('readout_time', 0.0,
          'rolling shutter: time from the exposure of the first row, at the stamp, to that of the '
          'last row; 0: global shutter', Range(0.0, 0.2, 's')),
-    Spec('max_wait', 0.35,
+    Spec('max_wait', MAX_WAIT,
          'longest time for which an image waits for odometry of its stamp; less if odometry '
          'usually comes sooner', Range(0.0, 1.0, 's')),
     Spec('odometry', 'odom',

@@ -38,7 +38,7 @@ from flock_follower.messages import (
 )
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import decode_image, GrayImage
+from flock_follower.perception.images import decode_image, DecodedImage, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.observed_wait import N_OBSERVED, ObservedWait
 from flock_follower.perception.pose_sources import PoseSources
@@ -229,7 +229,9 @@ class Perceiver:
                     image.stamp, pixels, image.model, image.camera)
         except ValueError as error:
             sighting.rejections.append((INVALID_IMAGE, str(error)))
-        return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
+        ahead = image.message.spent if isinstance(image.message, DecodedImage) else 0.0
+        return Processed(
+            image, sighting, pixels, ahead + (decoded - start), clock() - decoded)
 
     def _is_ready(self, image: PendingImage, now: float) -> bool:
         """Return whether to process an image now: it waits for calibration and odometry."""

@@ -65,10 +65,15 @@ class Neighborhood(NamedTuple):
 
     def clearance(self, n: Neighbor, params: PlannerParams) -> float:
         """Return the distance between the own hull and a neighbor's, m."""
-        return max(self.distances[n.name] - (params.radius + n.member.radius), 0.0)
+        return clearance(self.distances[n.name], n, params)
 
 
 NOBODY = Neighborhood((), {}, frozenset(), None, None, {})
+
+
+def clearance(distance: float, n: Neighbor, params: PlannerParams) -> float:
+    """Return the distance between the own hull and a neighbor's, m, from that of the centers."""
+    return max(distance - (params.radius + n.member.radius), 0.0)
 
 
 def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
@@ -122,8 +127,8 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     # A received position never removes the edge to the only leader in sight. Beyond the band such
     # an edge does not begin beside others: it would pull past the vehicle between.
     kept = [n.name for n in seen if len(seen) == 1 and n.member.role == LEADER and (
-        not held or n.name in held or max(math.dist(n.position, me.position) - (
-            params.radius + n.member.radius), 0.0) ** 2 < params.law.d1)]
+        not held or n.name in held
+        or clearance(math.dist(n.position, me.position), n, params) ** 2 < params.law.d1)]
     return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 
