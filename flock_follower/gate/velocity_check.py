@@ -197,13 +197,8 @@ def finite_vector(value: ArrayLike | None) -> Array | None:
 
 def plausible_velocity(value: ArrayLike) -> Array | None:
     """Return a velocity as an array (3,), m/s; None if not finite, or faster than FASTEST_OWN."""
-    try:
-        vector = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        return None
-    # Written so that NaN fails.
-    plausible = vector.shape == (3,) and math.hypot(*vector.tolist()) <= FASTEST_OWN
-    return vector if plausible else None
+    vector = finite_vector(value)
+    return vector if vector is not None and math.hypot(*vector.tolist()) <= FASTEST_OWN else None
 
 
 #: The difference is averaged over this time, s. In flights on real autopilots' simulators single
