@@ -43,6 +43,7 @@ from flock_follower.checks.processor import (
     LOAD_PERIOD,
     LoadMeter,
     longest_wait,
+    ran_for,
     stopped,
     threads_of,
 )
@@ -215,15 +216,9 @@ class Processes:
         return (self.log(name).strip().splitlines() or [f'{name} has printed nothing'])[-1]
 
     def cpu(self) -> dict[str, float]:
-        """Return the CPU time, s, that each running child has used; nothing without /proc."""
-        used = {}
-        for name, child in self.children.items():
-            with contextlib.suppress(OSError):
-                stat = Path(f'/proc/{child.pid}/stat').read_text(encoding='utf-8')
-                fields = stat.rpartition(')')[2].split()  # after the name, which may hold anything
-                if fields[0] != 'Z':
-                    used[name] = (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-        return used
+        """Return the CPU time, s, that each running child has used; 0 without /proc."""
+        return {name: ran_for(child.pid) for name, child in list(self.children.items())
+                if child.poll() is None}
 
     def wait_for_log(self, name: str, text: str, timeout: float = 40.0) -> None:
         """

@@ -18,8 +18,9 @@ Whether the machine was too busy: the time for which processes waited for a proc
 The kernel counts for each thread the time for which it ran, and for which it was ready and waited
 (``/proc/PID/task/TID/schedstat``). Processes that work together also wait for each other, on a
 quiet machine, too. So that part of their waiting counts for which other programs had the
-processors (``/proc/stat``). Both files are there in a container. Without them the load is unknown,
-and an unknown load excuses nothing.
+processors (``/proc/stat``). A process of ours that has ended has no file any more: what it ran is
+known from its parent (``getrusage``). The files are there in a container. Without them the load is
+unknown, and an unknown load excuses nothing.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from collections.abc import Callable, Iterable, Mapping
 import contextlib
 import os
 from pathlib import Path
+import resource
 from typing import Final, NamedTuple
 
 #: Share of LOAD_WINDOW for which processes wait for a processor that others have; busy above it.
@@ -45,6 +47,10 @@ class Counters(NamedTuple):
 
     time: float
     threads: Mapping[Path, tuple[int, int]]
+    ran: Mapping[int, float]
+    """Processor time of each process, s, with that of its ended threads."""
+    ended: float
+    """Processor time of all children that have ended, s."""
     machine: float
     """Processor time of all programs, s, on the processors that these processes may use."""
 
@@ -81,6 +87,21 @@ def threads_of(process: int, proc: Path = PROC) -> dict[Path, tuple[int, int]]:
     return found
 
 
+def ran_for(process: int, proc: Path = PROC) -> float:
+    """Return the processor time of a process, s; 0 if it has ended."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        stat = (proc / str(process) / 'stat').read_text(encoding='utf-8', errors='replace')
+        # The name, which may hold anything, ends with the last parenthesis.
+        return _TICK * sum(map(int, stat.rpartition(')')[2].split()[11:13]))
+    return 0.0
+
+
+def ended_children_ran_for() -> float:
+    """Return the processor time, s, of all children of this process that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
 def children(process: int, proc: Path = PROC) -> list[int]:
     """Return the ids of the children of a process."""
     found: list[int] = []
@@ -106,12 +127,14 @@ def longest_wait(before: Mapping[Path, tuple[int, int]],
 
 
 def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
-                  usable: Iterable[int] | None = None) -> Counters | None:
+                  usable: Iterable[int] | None = None, ended: float = 0.0) -> Counters | None:
     """
     Return the counters of some processes and of the machine, None if the kernel has none.
 
     :param now: s. :param usable: numbers of the processors; by default those of this process.
+    :param ended: the processor time, s, of all children of this process that have ended.
     """
+    processes = list(processes)
     threads = {path: counted for process in processes
                for path, counted in threads_of(process, proc).items()}
     names = {f'cpu{number}' for number in (
@@ -125,7 +148,8 @@ def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
                 ticks += sum(map(int, fields[:3])) + sum(map(int, fields[5:8]))
     except (OSError, ValueError):
         return None
-    return Counters(now, threads, ticks * _TICK) if threads else None
+    ran = {process: ran_for(process, proc) for process in processes}
+    return Counters(now, threads, ran, ended, ticks * _TICK) if threads else None
 
 
 def load_between(before: Counters, after: Counters, processors: int) -> Load:
@@ -133,9 +157,18 @@ def load_between(before: Counters, after: Counters, processors: int) -> Load:
     ran, waited = (1e-9 * sum(counted[k] - before.threads.get(path, (0, 0))[k]
                               for path, counted in after.threads.items()) for k in (0, 1))
     used = max(after.machine - before.machine, 0.0)
-    others = max(used - ran, 0.0)
-    share = waited / (ran + waited) * others / (others + ran) if waited > 0.0 else 0.0
+    ours = _ours(before, after)
+    others = max(used - ours, 0.0)
+    share = waited / (ran + waited) * others / (others + ours) if waited > 0.0 else 0.0
     return Load(share, others / max(after.time - before.time, 1e-9), processors)
+
+
+def _ours(before: Counters, after: Counters) -> float:
+    """Return the processor time, s, of our processes between two readings, ended ones included."""
+    running = sum(ran - before.ran.get(process, 0.0) for process, ran in after.ran.items())
+    gone = sum(ran for process, ran in before.ran.items() if process not in after.ran)
+    # Who is not our child and has ended counts as another program.
+    return running + max(after.ended - before.ended - gone, 0.0)
 
 
 class LoadMeter:
@@ -145,11 +178,13 @@ class LoadMeter:
     :param processes: returns their ids.
     :param proc: the folder of the kernel's process files.
     :param usable: numbers of the processors; by default those of this process.
+    :param ended: returns the processor time, s, of all children that have ended.
     """
 
     def __init__(self, processes: Callable[[], Iterable[int]], proc: Path = PROC,
-                 usable: Iterable[int] | None = None) -> None:
-        self._processes, self._proc = processes, proc
+                 usable: Iterable[int] | None = None,
+                 ended: Callable[[], float] = ended_children_ran_for) -> None:
+        self._processes, self._proc, self._ended = processes, proc, ended
         self._usable = tuple(os.sched_getaffinity(0) if usable is None else usable)
         self._recent: deque[Counters] = deque()
         self._windows: list[tuple[float, Load]] = []
@@ -158,7 +193,8 @@ class LoadMeter:
         """Read the counters at a time, s; a call within LOAD_PERIOD of the last one is ignored."""
         if self._recent and now - self._recent[-1].time < LOAD_PERIOD:
             return
-        counters = read_counters(self._processes(), now, self._proc, self._usable)
+        counters = read_counters(
+            self._processes(), now, self._proc, self._usable, self._ended())
         if counters is None:
             return
         self._recent.append(counters)

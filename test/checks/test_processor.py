@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import shutil
 
 import pytest
 
@@ -38,8 +39,9 @@ class Kernel:
     """A folder like /proc, of a machine with two processors and more that are not ours."""
 
     def __init__(self, proc: Path) -> None:
-        self.proc, self.time, self.used = proc, 0.0, 0.0
+        self.proc, self.time, self.used, self.ended = proc, 0.0, 0.0, 0.0
         self.threads: dict[tuple[int, int], list[float]] = {}
+        self.ended_threads: dict[int, float] = {}  # s that they ran, by their process
 
     def run(self, seconds: float, others: float, **shares: tuple[float, float]) -> None:
         """
@@ -60,6 +62,11 @@ class Kernel:
             folder = self.proc / str(process) / 'task' / str(thread)
             folder.mkdir(parents=True, exist_ok=True)
             (folder / 'schedstat').write_text(f'{round(1e9 * run)} {round(1e9 * wait)} 3\n')
+        for process in {process for process, _ in self.threads}:
+            ran = self.ended_threads.get(process, 0.0) + sum(
+                run for (owner, _), (run, _) in self.threads.items() if owner == process)
+            (self.proc / str(process) / 'stat').write_text(
+                f'{process} (a b) c) S {"7 " * 10}{round(ran / TICK)} 0 0 0\n')
         half = round(0.5 * self.used / TICK)
         idle = round(2.0 * self.time / TICK) - 2 * half
         self.proc.mkdir(exist_ok=True)
@@ -67,6 +74,20 @@ class Kernel:
             f'cpu  9 9 9 9 9 9 9 9 0 0\ncpu0 {half} 0 0 {idle} 0 0 0 0 0 0\n'
             f'cpu1 0 {half} 0 {idle} 7 0 0 0 0 0\ncpu2 {round(self.time / TICK)} 0 0 0 0 0 0 0\n'
             'intr 1 2 3\n')
+
+    def end_thread(self, process: int, thread: int) -> None:
+        """End a thread: its process keeps its processor time."""
+        ran, _ = self.threads.pop((process, thread))
+        self.ended_threads[process] = self.ended_threads.get(process, 0.0) + ran
+        shutil.rmtree(self.proc / str(process) / 'task' / str(thread))
+
+    def end(self, process: int) -> None:
+        """End a process: its parent has its processor time from then on."""
+        for owner, thread in list(self.threads):
+            if owner == process:
+                self.end_thread(owner, thread)
+        self.ended += self.ended_threads.pop(process)
+        shutil.rmtree(self.proc / str(process))
 
 
 @pytest.fixture
@@ -126,12 +147,40 @@ def test_new_thread_counts_from_start_and_ended_one_no_more(kernel: Kernel) -> N
     kernel.run(1.0, 0.0, p7_1=(0.1, 0.0), p7_2=(0.1, 0.9))
     meter = LoadMeter(lambda: [7], kernel.proc, (0, 1))
     meter.sample(kernel.time)
-    (kernel.proc / '7' / 'task' / '2' / 'schedstat').unlink()
-    del kernel.threads[7, 2]
+    kernel.end_thread(7, 2)
     kernel.run(2.0, 1.5, p7_1=(0.25, 0.0), p7_3=(0.25, 0.5))
     meter.sample(kernel.time)
     worst = meter.worst()
     assert worst is not None and worst.share == pytest.approx(0.5 * 0.75, abs=0.01)
+
+
+@pytest.mark.parametrize('before', [0.0, 0.5], ids=['started in the window', 'ran before'])
+def test_a_child_that_ends_is_no_other_program(kernel: Kernel, before: float) -> None:
+    meter = LoadMeter(lambda: [7, 8], kernel.proc, (0, 1), lambda: kernel.ended)
+    if before:
+        kernel.run(before, 0.0, p7_1=(0.5, 0.5), p8_1=(1.0, 0.0))
+    else:
+        kernel.run(0.5, 0.0, p7_1=(0.5, 0.5))
+    meter.sample(kernel.time)
+    kernel.run(1.0, 0.0, p7_1=(0.5, 0.5), p8_1=(1.0, 0.0))
+    kernel.end(8)
+    kernel.run(1.0, 0.0, p7_1=(0.5, 0.5))
+    meter.sample(kernel.time)
+    worst = meter.worst()
+    assert worst == pytest.approx((0.0, 0.0, 2), abs=0.01)
+
+
+def test_another_program_counts_beside_a_child_that_ends(kernel: Kernel) -> None:
+    meter = LoadMeter(lambda: [7, 8], kernel.proc, (0, 1), lambda: kernel.ended)
+    kernel.run(1.0, 0.0, p7_1=(0.5, 0.0), p8_1=(0.5, 0.0))
+    meter.sample(kernel.time)
+    kernel.run(1.0, 1.0, p7_1=(0.5, 0.5), p8_1=(0.5, 0.0))
+    kernel.end(8)
+    kernel.run(1.0, 1.5, p7_1=(0.5, 0.5))
+    meter.sample(kernel.time)
+    worst = meter.worst()
+    # They run for 0.75 of 2 processors and wait for 0.5; the others use 1.25.
+    assert worst == pytest.approx((0.5 * 1.25 / 2.0, 1.25, 2), abs=0.01)
 
 
 def test_without_the_kernels_counters_the_load_is_unknown(tmp_path: Path, kernel: Kernel) -> None:
