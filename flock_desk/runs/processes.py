@@ -273,23 +273,13 @@ class Processes:
         1 if it ended earlier by itself and should not. The time for which it waits for a processor
         is added to ``timeout``; TOO_BUSY_EXIT_CODE if it was cut off all the same.
         """
-        child = self.children.pop(name)
-        if child.poll() is not None:
-            return child.returncode or int(name not in self._ending)
-        before, begin = threads_of(child.pid), time.monotonic()
-        took = waited = 0.0
-        child.send_signal(signal.SIGINT)
-        while child.poll() is None:
-            if took > LONGEST_STOP or took - waited > timeout:
-                child.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(0.05)
-            waited = max(waited, longest_wait(before, threads_of(child.pid)))
-            took = time.monotonic() - begin
-        # A node that does not end in time is ended by an alarm of its own.
-        if child.returncode in (-signal.SIGKILL, -signal.SIGALRM) and waited > 0.5 * took:
-            return TOO_BUSY_EXIT_CODE
-        return None if child.returncode == -signal.SIGKILL else child.returncode
+        child = self.children[name]
+        try:
+            if child.poll() is not None:
+                return child.returncode or int(name not in self._ending)
+            return _stop(child, timeout)
+        finally:  # until then its processor time is ours
+            del self.children[name]
 
     def stop_all(self, timeout: float = 2.0) -> dict[str, int | None]:
         """Stop every child, the last started first, and return their exit codes."""
@@ -332,6 +322,24 @@ class Processes:
         """Measure the load until the block is left."""
         while not self._left.wait(LOAD_PERIOD):
             self.load.sample(time.monotonic())
+
+
+def _stop(child: subprocess.Popen[bytes], timeout: float) -> int | None:
+    """Send SIGINT to a child that runs, wait, and return its exit code as ``Processes.stop``."""
+    before, begin = threads_of(child.pid), time.monotonic()
+    took = waited = 0.0
+    child.send_signal(signal.SIGINT)
+    while child.poll() is None:
+        if took > LONGEST_STOP or took - waited > timeout:
+            child.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(0.05)
+        waited = max(waited, longest_wait(before, threads_of(child.pid)))
+        took = time.monotonic() - begin
+    # A node that does not end in time is ended by an alarm of its own.
+    if child.returncode in (-signal.SIGKILL, -signal.SIGALRM) and waited > 0.5 * took:
+        return TOO_BUSY_EXIT_CODE
+    return None if child.returncode == -signal.SIGKILL else child.returncode
 
 
 def computed(function: Callable[[Given], Result], tasks: Sequence[Given], jobs: int = 1,
