@@ -225,7 +225,9 @@ class Replay(FlockNode):
             due = self._timeline.due(stamp_ns)
             if now >= due:
                 break
-            self._publish_clock(self._timeline.position(now))
+            position = self._timeline.position(now)
+            if position - self._clock_ns >= CLOCK_PERIOD * NS_PER_S:
+                self._publish_clock(position)
             tick = max(CLOCK_PERIOD / self._timeline.rate, SHORTEST_CLOCK_PERIOD)
             time.sleep(max(0.0, min(due, self._next_service, now + tick) - time.monotonic()))
         self._lateness.append(now - due)

@@ -125,6 +125,8 @@ def test_every_message_is_sent_bit_for_bit_clock_knows_stamp(
     assert clocks == sorted(clocks) and clocks[0] == START
     assert {START + i * PERIOD for i in range(COUNT)} <= set(clocks)
     assert np.median(np.diff(clocks)) <= 6_500_000  # 200 Hz of bag time between the messages
+    # No more of them: every node that uses the time of the bag wakes for each.
+    assert len(clocks) <= COUNT * PERIOD / 5_000_000 + COUNT
 
 
 def test_start_and_topics_choose_what_is_played(
