@@ -30,8 +30,7 @@ import difflib
 import sys
 import time
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
@@ -86,15 +85,19 @@ class Caller(Node):
 
     def spin(self) -> int:
         """Call, print the answer, and return the exit code."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
         try:
-            success, answer = self._call()
+            success, answer = self._call(executor)
         except (ExternalShutdownException, KeyboardInterrupt):
             return 130
+        finally:
+            executor.shutdown(timeout_sec=0.5)
         print(f'{"" if success else "error: "}{self._service}: {answer}',
               file=sys.stdout if success else sys.stderr)
         return 0 if success else 1
 
-    def _call(self) -> tuple[bool, str]:
+    def _call(self, executor: SingleThreadedExecutor) -> tuple[bool, str]:
         """Wait for the service, call it once, and return its answer, or what failed."""
         deadline = time.monotonic() + self._timeout
         while not self._client.service_is_ready():
@@ -103,13 +106,13 @@ class Caller(Node):
                          if f'std_srvs/srv/{self._kind.__name__}' in kinds]
                 return False, (f'no such service of type {self._kind.__name__} within '
                                f'{self._timeout:g} s{proposal(self._service, there)}')
-            rclpy.spin_once(self, timeout_sec=POLL_PERIOD)
+            executor.spin_once(timeout_sec=POLL_PERIOD)
         future = self._client.call_async(self._request)
         deadline = time.monotonic() + patience(self._service)
         while not future.done():
             if time.monotonic() >= deadline or not self._client.service_is_ready():
                 return False, 'no answer: the result is unknown'
-            rclpy.spin_once(self, timeout_sec=POLL_PERIOD)
+            executor.spin_once(timeout_sec=POLL_PERIOD)
         return future.result().success, future.result().message
 
 
