@@ -61,22 +61,12 @@ import numpy as np
 
 from flock_follower.geometry import GRAVITY, SHORTEST, wrap_angle
 from flock_follower.messages import SANE
+from flock_follower.planner.bound_keeping import Bound, COHESION, FENCE, SEPARATION, SIGHT
 from flock_follower.planner.inputs import (
     Neighbor,
     OwnState,
     predict,
     Prediction,
-)
-from flock_follower.planner.limits import (
-    Bound,
-    COHESION,
-    difference,
-    FENCE,
-    horizontal,
-    opposite,
-    scalar_product,
-    SEPARATION,
-    SIGHT,
 )
 from flock_follower.planner.params import (
     Edges,
@@ -86,6 +76,7 @@ from flock_follower.planner.params import (
     PlannerParams,
 )
 from flock_follower.planner.sight import IMAGE_MARGIN, vertical, View
+from flock_follower.planner.vectors import difference, horizontal, opposite, scalar_product
 from flock_follower.planner.vertical_yaw import OVERHEAD_DISTANCE
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.

@@ -32,6 +32,14 @@ import numpy as np
 
 from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
+from flock_follower.planner.bound_keeping import (
+    Bound,
+    COHESION,
+    FENCE,
+    keep_bounds,
+    limit_horizontal,
+    SEPARATION,
+)
 from flock_follower.planner.bounds import (
     clear_of_sphere,
     DOWNWASH_SHARE,
@@ -49,23 +57,13 @@ from flock_follower.planner.inputs import (
     predict,
     Prediction,
 )
-from flock_follower.planner.limits import (
-    Bound,
-    COHESION,
-    difference,
-    FENCE,
-    keep_bounds,
-    limit_command,
-    limit_horizontal,
-    LimitedCommand,
-    scalar_product,
-    SEPARATION,
-)
+from flock_follower.planner.limits import limit_command, LimitedCommand
 from flock_follower.planner.memory import Loss, max_age, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.scene import RECEIVED_SIGMAS, Scene, silent
 from flock_follower.planner.sight import View
+from flock_follower.planner.vectors import difference, scalar_product
 
 HORIZONTAL_AXES = np.array([1.0, 1.0, 0.0])  # factors of x, y, z
 

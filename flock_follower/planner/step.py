@@ -33,6 +33,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner import relative
+from flock_follower.planner.bound_keeping import SEPARATION
 from flock_follower.planner.guard import (
     climb_range,
     constrain,
@@ -41,7 +42,6 @@ from flock_follower.planner.guard import (
     retreat,
 )
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
-from flock_follower.planner.limits import SEPARATION
 from flock_follower.planner.memory import ingest, Memory, update_pending
 from flock_follower.planner.modes import blind, next_state, odometry_delay, odometry_fault, State
 from flock_follower.planner.neighborhood import last_known, nominal, reports

@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, GRAVITY
+from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import (
     COLUMN_ANGLE,
     in_sight,
@@ -35,7 +36,6 @@ from flock_follower.planner.bounds import (
 )
 from flock_follower.planner.guard import sort_bounds
 from flock_follower.planner.inputs import Neighbor, Prediction
-from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
 from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion, WIDEST
