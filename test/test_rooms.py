@@ -39,9 +39,12 @@ SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals', 'who
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
+    'acceleration_messages': ('messages', 'numpy'),
     'command_messages': ('messages', 'numpy'),
     'pose_messages': ('messages', 'numpy'),
     'flocking': ('', 'numpy'),
+    # NED is inside what speaks MAVLink.
+    'ned': ('', 'numpy'),
     'bridge_state': ('', ''),
     'topic_names': ('messages', ''),
     # The markers by name and size alone: the planner reads the file, too.
@@ -50,12 +53,13 @@ ROOMS = {
     # Tables, defaults and ranges stand with what they are for.
     'parameters': ('odometry', 'yaml'),
     'flock': ('flocking messages', 'numpy'),
-    'planner': ('bridge_state command_messages flock flocking messages neighbors_file odometry '
-                'parameters', 'numpy'),
-    'perception': ('messages neighbors_file odometry parameters pose_messages', 'cv2 numpy'),
+    'planner': ('acceleration_messages bridge_state command_messages flock flocking messages '
+                'neighbors_file odometry parameters', 'numpy'),
+    'perception': ('acceleration_messages messages neighbors_file odometry parameters '
+                   'pose_messages', 'cv2 numpy'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'gate': ('bridge_state command_messages messages planner', 'numpy'),
-    'mavlink': ('bridge_state gate messages odometry parameters', 'numpy pymavlink'),
+    'mavlink': ('bridge_state gate messages ned odometry parameters', 'numpy pymavlink'),
     'bags': ('parameters', 'mcap numpy rosbags yaml'),
     'flight_parameters': ('mavlink parameters perception planner', ''),
     'checks': ('bags bridge_state messages neighbors_file odometry parameters perception '
@@ -67,20 +71,21 @@ ROOMS = {
              'aiohttp cv2 numpy'),
     'support': ('bridge_state gate mavlink messages odometry parameters perception '
                 'pose_messages', 'ROS numpy'),
-    'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages '
-              'neighbors_file odometry parameters perception planner pose_messages support '
-              'topic_names view',
+    'nodes': ('acceleration_messages bags bridge_state checks command_messages flock gate '
+              'mavlink messages neighbors_file odometry parameters perception planner '
+              'pose_messages support topic_names view',
               'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
-    'vehicles': ('', 'numpy pymavlink'),
-    'external': ('mavlink', 'numpy pymavlink'),
+    'vehicles': ('ned', 'numpy pymavlink'),
+    'external': ('mavlink ned', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'follower': ('command_messages flock gate messages perception planner pose_messages', ''),
+    'follower': ('acceleration_messages command_messages flock gate messages perception planner '
+                 'pose_messages', ''),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock flocking follower gate mavlink messages '
-                    'neighbors_file odometry perception planner pose_messages scenarios sensors '
-                    'vehicles', 'numpy'),
+    'closed_loop': ('acceleration_messages camera external flock flocking '
+                    'follower gate mavlink messages neighbors_file odometry perception planner '
+                    'pose_messages scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop command_messages flocking flocks follower gate '
              'mavlink messages neighbors_file odometry parameters perception planner '

@@ -37,6 +37,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.follower import ControlCycle, Follower, Listener, Tick
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import ENGAGE_TIME, Operation, Scenario, VioErrors
+from flock_follower.acceleration_messages import AccelerationState, with_acceleration
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
 from flock_follower.gate.envelope import GateLimits
@@ -51,13 +52,7 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 from flock_follower.mavlink.dialects import PX4
-from flock_follower.messages import (
-    AccelerationState,
-    OdometryState,
-    RELATIVE,
-    to_nanoseconds,
-    with_acceleration,
-)
+from flock_follower.messages import OdometryState, RELATIVE, to_nanoseconds
 from flock_follower.perception.neighbor_motion import POSITION, VELOCITY
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop

@@ -32,11 +32,8 @@ from flock_follower.gate.permission import MODE_TIMEOUT
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.geometry import (
     Array,
-    frd_to_flu,
-    ned_to_enu,
     normalize_quaternion,
     quaternion_multiply,
-    quaternion_ned_frd_to_enu_flu,
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
 )
@@ -49,6 +46,7 @@ from flock_follower.mavlink.estimator_health import (
     GpsFix,
 )
 from flock_follower.messages import OdometryState
+from flock_follower.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0

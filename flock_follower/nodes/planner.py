@@ -46,11 +46,11 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.acceleration_messages import from_acceleration
 from flock_follower.bridge_state import ARMED_AT_TOPIC, BridgeState
 from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
 from flock_follower.command_messages import trajectory
 from flock_follower.messages import (
-    from_acceleration,
     from_odometry,
     MOTION_TOPIC,
     OdometryState,
