@@ -15,11 +15,12 @@
 """
 One image on its way through perception: the expected and the found content.
 
-``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
-shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbor
-counts as seen when the row of its markers' middle was exposed. The rows above and below see it
-earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners to
-where they were with the middle row, by the relative motion, which comes mostly from the own rates.
+``CameraMotion`` is the camera's pose and motion at the time of an image, or of one of its rows. A
+rolling shutter exposes row r of an image of height h r / h * readout_time after the first row. A
+neighbor counts as seen when the row of its markers' middle was exposed. The rows above and below
+see it earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners
+to where they were with the middle row, by the relative motion, which comes mostly from the own
+rates.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ MAX_TURN = 0.3  # rad: a fit whose attitude differs by more from the detection's
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
-class View(NamedTuple):
+class CameraMotion(NamedTuple):
     """
     The own state at that time, and the camera's pose in the smooth frame of ``OdometryBuffer``.
 
@@ -67,7 +68,7 @@ class View(NamedTuple):
     T_smooth_camera: Transform
 
     @classmethod
-    def of(cls, own: OdometrySample, T_body_camera: Transform) -> View:
+    def of(cls, own: OdometrySample, T_body_camera: Transform) -> CameraMotion:
         """Return the view of a camera mounted at ``T_body_camera``."""
         body = own.smooth_pose
         return cls(own, body.rotation, body @ T_body_camera)
@@ -246,7 +247,7 @@ class Look:
     """When its middle row was exposed, by the camera's clock, s; ``view`` is of that time."""
     camera: MountedCamera
     model: CameraModel
-    view: View
+    view: CameraMotion
     near: Sequence[str]
     anywhere: Sequence[str]
     expected: dict[str, PosePrior]

@@ -75,7 +75,7 @@ from flock_follower.planner.params import (
     Member,
     PlannerParams,
 )
-from flock_follower.planner.sight import IMAGE_MARGIN, vertical, View
+from flock_follower.planner.sight import FieldsOfView, IMAGE_MARGIN, vertical
 from flock_follower.planner.vectors import difference, horizontal, opposite, scalar_product
 from flock_follower.planner.vertical_yaw import OVERHEAD_DISTANCE
 
@@ -209,7 +209,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
 
 
 def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Prediction, yaw: float,
-                 view: View, params: PlannerParams) -> list[Bound]:
+                 view: FieldsOfView, params: PlannerParams) -> list[Bound]:
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
 

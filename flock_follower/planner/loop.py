@@ -32,7 +32,7 @@ from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import odometry_fault, State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, View
+from flock_follower.planner.sight import FieldOfView, FieldsOfView
 from flock_follower.planner.step import Decision, step
 
 #: Largest standard deviation of a neighbor's yaw that is used, rad.
@@ -58,7 +58,7 @@ class PlannerLoop:
     def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
-        self.view: View = ()
+        self.view: FieldsOfView = ()
         """Fields of view of the cameras; () if unknown."""
         self._fields: dict[str, FieldOfView] = {}
         self.ground: float | None = None

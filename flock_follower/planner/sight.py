@@ -98,11 +98,11 @@ class FieldOfView(NamedTuple):
         return max(off - self.left + edge, edge - self.right - off, 0.0)
 
 
-View = tuple[FieldOfView, ...]
+FieldsOfView = tuple[FieldOfView, ...]
 """Fields of view of all cameras; () if unknown."""
 
 
-def visible(view: View, offset: Array, yaw: float, forward: float, margin: float) -> bool:
+def visible(view: FieldsOfView, offset: Array, yaw: float, forward: float, margin: float) -> bool:
     """
     Return whether a neighbor is in an image, by at least a margin, m, at its place.
 
@@ -119,7 +119,7 @@ def visible(view: View, offset: Array, yaw: float, forward: float, margin: float
         forward * math.cos(f.heading) / GRAVITY) <= f.up - edge for f in view)
 
 
-def vertical(view: View, bearing: float) -> tuple[float, float]:
+def vertical(view: FieldsOfView, bearing: float) -> tuple[float, float]:
     """
     Return the largest angles up and down, rad, of the images nearest to a bearing.
 
@@ -147,7 +147,7 @@ class Occlusion(NamedTuple):
 
 
 def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
-              frames: Sequence[float], view: View, forward: float) -> Occlusion | None:
+              frames: Sequence[float], view: FieldsOfView, forward: float) -> Occlusion | None:
     """
     Return the occlusion of a neighbor, or None.
 

@@ -47,13 +47,13 @@ from flock_follower.planner.modes import blind, next_state, odometry_delay, odom
 from flock_follower.planner.neighborhood import last_known, nominal, reports
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.scene import Decision, expected_now, Scene, survey
-from flock_follower.planner.sight import Occlusion, occlusion, View
+from flock_follower.planner.sight import FieldsOfView, Occlusion, occlusion
 from flock_follower.planner.vertical_yaw import Altitude, face_yaw, search_yaw, turn_rate
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          estimates: Iterable[Neighbor], params: PlannerParams, looked: float | None = None,
-         waiting: str = '', view: View = (), ground: float | None = None,
+         waiting: str = '', view: FieldsOfView = (), ground: float | None = None,
          frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
     Return the memory for the next step, and the decision for the time ``now``, s.
@@ -113,7 +113,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
-          blinded: str, waiting: str, view: View, frames: Sequence[float]
+          blinded: str, waiting: str, view: FieldsOfView, frames: Sequence[float]
           ) -> tuple[Memory, State, str, float | None]:
     """
     Return memory, state, the reason for the state, and the stamp of the newest estimate, s.
@@ -141,7 +141,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
 
 
 def _judge_occlusion(memory: Memory, now: float, frames: Sequence[float],
-                     view: View) -> Occlusion | None:
+                     view: FieldsOfView) -> Occlusion | None:
     """Return the occlusion of the faced neighbor, or None."""
     if memory.own is None or memory.followed is None:
         return None

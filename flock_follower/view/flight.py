@@ -79,7 +79,7 @@ class NodeReport(NamedTuple):
     values: Mapping[str, str]
 
 
-class Battery(NamedTuple):
+class ShownBattery(NamedTuple):
     """Share of the charge, and V; NaN if unknown."""
 
     time: float
@@ -99,7 +99,7 @@ class ShownFlight:
         self._state = ''
         self._bridge: BridgeState | None = None
         self._reports: dict[str, NodeReport] = {}
-        self._battery = Battery(-math.inf, math.nan, math.nan)
+        self._battery = ShownBattery(-math.inf, math.nan, math.nan)
         self._distance: tuple[str, float] = '', math.nan
         self._distances: deque[tuple[float, float]] = deque()
         self._tracks: dict[str, deque[tuple[float, float, float]]] = {}
@@ -152,7 +152,7 @@ class ShownFlight:
         if node in LIMITS:
             self.note(node, report.time)
 
-    def take_battery(self, battery: Battery) -> None:
+    def take_battery(self, battery: ShownBattery) -> None:
         """Take the state of the battery."""
         self._battery = battery
         self.note('battery', battery.time)
