@@ -105,6 +105,21 @@ FLIES = {
     'mavlink_bridge': 'ROS ament_index_python numpy pymavlink yaml',
     'flock': 'ROS ament_index_python numpy yaml',
 }
+_ALL_LOAD = 'messages nodes odometry parameters support'
+#: The rooms that each of them loads.
+LOADED_ROOMS = {
+    'relative_pose': f'acceleration_messages neighbors_file perception pose_messages {_ALL_LOAD}',
+    'planner': 'acceleration_messages bridge_state command_messages flock flocking '
+               f'neighbors_file planner {_ALL_LOAD}',
+    'mavlink_bridge': f'bridge_state command_messages gate mavlink ned planner {_ALL_LOAD}',
+    'flock': f'flock {_ALL_LOAD}',
+}
+#: What the gate needs of the planner.
+LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',
+          'flock_follower.planner.projection'}
+#: The most statements that each of them may load, without docstrings and imports.
+MOST_STATEMENTS = {
+    'relative_pose': 5450, 'planner': 3700, 'mavlink_bridge': 5830, 'flock': 2000}
 
 
 class Module(NamedTuple):
@@ -235,11 +250,28 @@ def test_a_node_that_flies_loads_only_the_libraries_it_may(node):
 
 
 @pytest.mark.parametrize('node', FLIES)
-def test_flight_node_loads_no_checks_bags_or_foreign_tables(node):
+def test_a_flight_node_loads_only_the_rooms_of_its_work(node):
     rooms = {HOUSE[name].room for name in loaded(f'flock_follower.nodes.{node}')}
-    assert not rooms & {'checks', 'bags', 'flight_parameters'}
-    assert rooms & {'gate', 'mavlink', 'perception'} == {
-        'relative_pose': {'perception'}, 'mavlink_bridge': {'gate', 'mavlink'}}.get(node, set())
+    assert rooms - SHARED - {'flock_follower'} == {*LOADED_ROOMS[node].split()}
+
+
+def test_the_bridge_loads_only_the_limits_of_the_planner():
+    assert LIMITS == {name for name in loaded('flock_follower.nodes.mavlink_bridge')
+                      if HOUSE[name].room == 'planner'}
+
+
+def count_statements(path: Path) -> int:
+    return sum(isinstance(each, ast.stmt) and not isinstance(each, (ast.Import, ast.ImportFrom))
+               and not (isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant))
+               for each in ast.walk(ast.parse(path.read_text())))
+
+
+@pytest.mark.parametrize('node', FLIES)
+def test_a_flight_node_loads_no_more_than_now(node):
+    names = module_names()
+    total = sum(count_statements(names[name])
+                for name in loaded(f'flock_follower.nodes.{node}'))
+    assert total <= MOST_STATEMENTS[node]
 
 
 def test_no_node_loads_the_tables_of_all():

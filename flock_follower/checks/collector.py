@@ -45,10 +45,10 @@ from flock_follower.parameters.sections import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
-from flock_follower.perception.markers import concatenate_detections, Detections
+from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
-from flock_follower.perception.prints import turned_print, with_wide_borders, wrong_border
+from flock_follower.perception.prints import BORDER_WIDTHS, turned_print, wrong_border
 from flock_follower.perception.search import everywhere
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pose_messages import from_pose
@@ -188,9 +188,9 @@ class Collector:
         thoroughly = partial(everywhere, markers=[marker for _, marker in markers.values()])
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary)
-            for search in (thoroughly, with_wide_borders):  # which take longer
+            for search in (thoroughly, _with_wide_borders):  # which take longer
                 if not markers.keys() & set(found.ids.tolist()):
-                    found = concatenate_detections(found, search(pixels, config.dictionary))
+                    found = _concatenate(found, search(pixels, config.dictionary))
             fits = camera is not None and pixels.shape == (camera.height, camera.width)
             up = _upwards(seen, path, picture.stamp) if len(found.ids) else None
             seen.sightings += self._measure(
@@ -268,3 +268,15 @@ def _upwards(seen: Observations, path: OwnPath | None, stamp: float) -> Array | 
     R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
     up: Array = (quaternion_to_matrix(quaternions[0]) @ R_base_optical)[2]
     return up if known[0] else None
+
+
+def _with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
+    """Return the markers with a border of two or three cells, and some with one."""
+    return _concatenate(*(
+        everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
+
+
+def _concatenate(*found: Detections) -> Detections:
+    """Return all the markers of several searches."""
+    return Detections(np.concatenate([each.ids for each in found]),
+                      np.concatenate([each.corners for each in found]))
