@@ -30,7 +30,6 @@ from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.neighbor_filter import UpdateOutcome
-from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import LATE_POSE, MANY_OUTLIERS, Sourced
 from flock_follower.perception.tracker import Tracker
@@ -55,13 +54,14 @@ class Arrival(NamedTuple):
 
 def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]],
                 states: Iterable[OdometryState], cameras: Mapping[str, Transform],
-                static: StaticFrames) -> dict[str, SourceSeen]:
+                static: StaticFrames, max_wait: float) -> dict[str, SourceSeen]:
     """
     Return the outcome of the poses of each neighbor in the filter and gates of relative_pose.
 
     :param cameras: the optical frames of the own cameras on the body, by name.
+    :param max_wait: the longest time for which a pose waits for odometry of its stamp, s.
     """
-    perceiver = Perceiver(Tracker(config, Transform()), max_wait=MAX_WAIT)
+    perceiver = Perceiver(Tracker(config, Transform()), max_wait=max_wait)
     perceiver.sources.frames.update(cameras)
     perceiver.sources.static = static
     seen = {n.name: SourceSeen(n.source.topic) for n in config.neighbors if n.source is not None}
@@ -87,6 +87,9 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
         for outcome in perceiver.sources.due(time):
             if isinstance(outcome, Sourced):
                 _count(seen[outcome.name], outcome)
+            elif not isinstance(outcome, int):  # odometry never reached its stamp
+                reason, detail = outcome
+                seen[detail.partition(':')[0]].refused[reason] += 1
     for name, its in seen.items():
         its.frame = frames[name]
     return seen
