@@ -23,7 +23,7 @@ gate, as ``follower.Follower``. The embedded PX4 flies the setpoints.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -59,6 +59,7 @@ from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.tracker import Tracker
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
+from flock_follower.planner.params import Member
 from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseState
 from flock_follower.ranges import parameter, Range
 
@@ -135,7 +136,8 @@ class DetectorFlight(Listener):
             'name': LEADER, 'pose_topic': 'poses', 'position_only': detector.position_only}]}),
             T_BODY_OPTICAL, params)
         self._follower = Follower(
-            PlannerLoop(), scenario.flight.planner(True), gate, self, make,
+            PlannerLoop(), replace(scenario.flight.planner(True), vehicles={
+                LEADER: Member(faces=())}), gate, self, make,
             perceiver=Perceiver(tracker, max_wait=MAX_WAIT))
         self._coming: list[tuple[float, int, PoseState | None]] = []
         """Results under way: when each arrives, s, the stamp of its image, ns, and the pose."""
