@@ -26,12 +26,13 @@ from flock_follower.bags.message_types import empty
 from flock_follower.checks.collector import Collector, POSES
 from flock_follower.checks.findings import ERROR, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
-from flock_follower.checks.pose_topics import check_poses
+from flock_follower.checks.pose_topics import check_poses, PREDICT_TIMEOUT
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
 from flock_follower.messages import odometry, to_nanoseconds
 from flock_follower.neighbors_file import parse
 from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME, UNPLACED
 from flock_follower.perception.tracker import camera_mounting
+from flock_follower.planner.params import PlannerParams
 from flock_follower.pose_messages import POSE, pose_with_covariance
 from flock_follower.topic_names import names_there
 
@@ -74,7 +75,8 @@ def levels(change: Change = lambda message, k: message, latency: float = 0.03,
             message = change(pose_with_covariance(
                 empty, to_nanoseconds(stamp), 'optical',
                 Transform(pose.rotation, pose.translation + error), COVARIANCE), k // 5)
-            collector.take(POSES, '/poses', message, stamp + latency)
+            if message is not None:
+                collector.take(POSES, '/poses', message, stamp + latency)
     collector.finish(parse({'neighbors': [{'name': 'leader', 'pose_topic': 'poses'}],
                             **({'frames_topic': frames_topic} if frames_topic else {})}))
     return seen, {finding.what.removeprefix('poses of leader').strip(): finding.level
@@ -85,6 +87,11 @@ def outlier(message: Any, k: int) -> Any:
     if k % 20 == 7:
         message.pose.pose.position.z += 1.0
     return message
+
+
+def with_bursts_missing(message: Any, k: int) -> Any:
+    """Lack five poses of each twenty."""
+    return None if k % 20 < 5 else message
 
 
 def in_frame(message: Any, k: int) -> Any:
@@ -101,13 +108,15 @@ def without_attitude(message: Any, k: int) -> Any:
 
 def test_poses_that_are_well_have_no_fault() -> None:
     seen, rows = levels()
-    assert rows == {'': OK, 'rate': OK, 'latency': OK, 'used': OK, 'outliers': OK, 'axes': OK}
+    assert rows == {'': OK, 'rate': OK, 'latency': OK, 'gaps': OK, 'used': OK,
+                    'outliers': OK, 'axes': OK}
     assert seen.sources['leader'].taken == 60
 
 
 @pytest.mark.parametrize(('options', 'faults'), [
     ({'latency': 0.15}, {'latency': WARNING}),
-    ({'latency': 0.5}, {'latency': ERROR}),
+    ({'latency': 0.5}, {'latency': ERROR, 'gaps': WARNING}),
+    ({'change': with_bursts_missing}, {'gaps': WARNING}),
     ({'change': outlier}, {'outliers': WARNING}),
     ({'change': outlier, 'latency': 0.15}, {'outliers': WARNING, 'latency': WARNING}),
     ({'change': in_frame}, {'used': ERROR, 'outliers': UNMEASURED, 'axes': UNMEASURED}),
@@ -118,6 +127,10 @@ def test_poses_that_are_well_have_no_fault() -> None:
 def test_each_fault_of_poses_has_its_row(options: dict[str, Any], faults: dict[str, str]) -> None:
     _, rows = levels(**options)
     assert {what: level for what, level in rows.items() if level != OK} == faults
+
+
+def test_gaps_are_those_of_the_planner() -> None:
+    assert PREDICT_TIMEOUT == PlannerParams.predict_timeout
 
 
 def test_refused_poses_are_counted_by_their_reasons() -> None:
