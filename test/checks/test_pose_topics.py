@@ -130,7 +130,7 @@ def test_each_fault_of_poses_has_its_row(options: dict[str, Any], faults: dict[s
 
 
 def test_gaps_are_those_of_the_planner() -> None:
-    assert PREDICT_TIMEOUT == PlannerParams.predict_timeout
+    assert PlannerParams.predict_timeout == PREDICT_TIMEOUT
 
 
 def test_refused_poses_are_counted_by_their_reasons() -> None:
