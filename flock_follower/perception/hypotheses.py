@@ -30,6 +30,13 @@ is, nor ever beside it           of the primary track ``leader_speed_max`` reach
 out of view                      after PATIENCE, if it has moved; never, if it stands still
 ===============================  ================================================================
 
+Poses by another detector have no id that is printed elsewhere, but single ones are outliers:
+
+- A primary track with fewer than CONFIRMED measurements may have begun with an outlier: a
+  candidate that has CONFIRMED since then takes its place.
+- A candidate that is not confirmed gets no measurement near the primary track: else the place of
+  an outlier ahead of a neighbor takes the measurements of that neighbor as it passes.
+
 Positions are in the smooth frame of ``OdometryBuffer``.
 """
 
@@ -133,10 +140,14 @@ class Taken(NamedTuple):
 
 
 class Hypotheses:
-    """The primary track of one neighbor, and the candidates with the same marker."""
+    """
+    The primary track of one neighbor, and the candidates with the same marker.
 
-    def __init__(self, params: FilterParams) -> None:
-        self.params = params
+    :param marked: whether the neighbor carries markers; else another detector measures its poses.
+    """
+
+    def __init__(self, params: FilterParams, marked: bool = True) -> None:
+        self.params, self._marked = params, marked
         self.primary = NeighborFilter(params)
         self.reset()
 
@@ -144,6 +155,7 @@ class Hypotheses:
         """Forget all of them."""
         self.primary.reset()
         self._motion = _Motion()
+        self._measured = 0  # measurements of the primary track since it started
         self._lost: Array | None = None
         """Where the primary track was before it restarted (3,), m; None if it did not."""
         self.candidates: list[Candidate] = []
@@ -157,10 +169,15 @@ class Hypotheses:
         """Return the candidate that a measurement at a place (3,), m, belongs to, or None."""
         if not self.candidates:
             return None
-        nearest = min(self.candidates, key=lambda each: each.distance(time, place))
+        nearest = self._nearest(time, place)
         expected = self.primary.place(time)
         least = SAME if expected is None else min(SAME, math.dist(place, expected.translation))
+        if not self._marked and least < SAME and not nearest.confirmed:
+            return None
         return nearest if nearest.distance(time, place) < least else None
+
+    def _nearest(self, time: float, place: Array) -> Candidate:
+        return min(self.candidates, key=lambda each: each.distance(time, place))
 
     def take(self, time: float, measured: Transform, reference: Array, covariance: Array,
              another: bool = False, alike: Array | None = None) -> Taken:
@@ -181,7 +198,7 @@ class Hypotheses:
                 *arguments, alike)
             if outcome is not UpdateOutcome.OUTLIER:
                 return Taken(outcome)
-            candidate = self._add(time, measured.translation)
+            candidate = self._refused(time, measured.translation)
         if time <= candidate.seen:
             return Taken(UpdateOutcome.LATE, candidate)
         candidate.take(*arguments)
@@ -192,6 +209,14 @@ class Hypotheses:
             self._exchange(candidate)
             return Taken(UpdateOutcome.STARTED)
         return Taken(UpdateOutcome.OUTLIER, candidate)
+
+    def _refused(self, time: float, place: Array) -> Candidate:
+        """Return the candidate of a measurement (3,), m, that the primary track refused."""
+        if not self._marked and self.candidates:
+            nearest = self._nearest(time, place)
+            if nearest.distance(time, place) < SAME:
+                return nearest
+        return self._add(time, place)
 
     def _update_primary(self, time: float, measured: Transform, reference: Array,
                         covariance: Array, alike: Array | None) -> UpdateOutcome:
@@ -205,7 +230,9 @@ class Hypotheses:
                                       reach if surprised else 0.0, alike)
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
+            self._measured = 0
         if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
+            self._measured += 1
             self._motion.take(time, measured.translation)
             for each in self.candidates:
                 each.alone = 0
@@ -220,6 +247,8 @@ class Hypotheses:
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
         """Return whether a candidate replaces the primary track; see the module."""
         moved, last = candidate.motion.moved, self.primary.newest
+        if not self._marked and self._measured < CONFIRMED <= candidate.alone:
+            return True
         if candidate.measured < self.params.max_rejections:
             return False
         if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
@@ -245,6 +274,7 @@ class Hypotheses:
         self.primary.reset()
         self.primary.newest = candidate.track.newest
         self._motion, candidate.motion = candidate.motion, self._motion
+        self._measured = candidate.measured
         candidate.track, candidate.alone = before, 0
         if not candidate.beside:
             self.candidates.remove(candidate)

@@ -167,8 +167,8 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     if before is None:
         offset = propagate(n, me.stamp).position - me.position
         patient = not n.member.faces and me.stamp - n.stamp < MOST_PATIENT
-        lost = missed >= (IMAGES_WITHOUT_MARKER if patient else IMAGES) and visible(
-            view, offset, me.yaw, forward, OCCLUSION_MARGIN)
+        needed = IMAGES_WITHOUT_MARKER if patient else IMAGES
+        lost = missed >= needed and visible(view, offset, me.yaw, forward, OCCLUSION_MARGIN)
         return Occlusion(n.stamp) if lost else None
     if missed >= IMAGES:
         return Occlusion(n.stamp)
