@@ -221,7 +221,7 @@ def test_of_another_detector_five_missed_images_make_it_occluded() -> None:
 
 
 @given(st.lists(st.floats(0.3, 2.4), max_size=12), st.floats(0.3, 2.4))
-def test_occlusion_waits_for_more_images_of_another_detector_only_for_a_while(
+def test_occlusion_of_another_detector_waits_only_for_a_while(
         stamps: list[float], newest: float) -> None:
     """Never earlier than with a marker; from MOST_PATIENT on, at the same time."""
     me, images = own(2.4), sorted(stamps)
