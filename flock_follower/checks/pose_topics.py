@@ -118,8 +118,8 @@ def check_poses(seen: Observations) -> Iterator[Finding]:
         yield _check_published(seen, what, its, topic)
         if topic.arrivals:
             yield check_rate(seen, what, topic, (MIN_RATE, 0.0),
-                             'raise the rate of the detector: perception_timeout after an image the '
-                             'planner brakes; hold the neighbor in its sight')
+                             'raise the rate of the detector: the planner brakes without images; '
+                             'hold the neighbor in its sight')
             yield check_latency(
                 seen, what, topic, (LATE_POSE, MAX_LATENCY),
                 'give the detector more processor time, or smaller images; the follower acts on '

@@ -232,7 +232,7 @@ def pose_outcomes(marked: bool, speed: float, outlier: Array, at: int) -> list[U
     return found
 
 
-def test_a_track_that_began_with_an_outlier_of_another_detector_begins_anew() -> None:
+def test_a_track_that_began_with_an_outlier_begins_anew() -> None:
     begun = pose_outcomes(False, 0.0, np.array([0.0, 1.0, 0.0]), 0)
     assert begun[:4] == [UpdateOutcome.STARTED, *[UpdateOutcome.OUTLIER] * 2,
                          UpdateOutcome.STARTED]
@@ -244,7 +244,7 @@ def test_a_track_that_began_with_an_outlier_of_another_detector_begins_anew() ->
 
 @pytest.mark.parametrize('length', [0.3, 1.2, 3.0])
 @pytest.mark.parametrize('towards', [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.7, 0.7)])
-def test_the_place_of_an_outlier_takes_no_pose_of_a_neighbor_that_passes(
+def test_the_place_of_an_outlier_takes_no_later_pose(
         length: float, towards: tuple[float, float]) -> None:
     outlier = length * np.array([*towards, 0.0])
     found = pose_outcomes(False, 1.2, outlier, 15)
