@@ -32,8 +32,8 @@ out of view                      after PATIENCE, if it has moved; never, if it s
 
 Poses by another detector have no id that is printed elsewhere, but single ones are outliers:
 
-- A primary track with fewer than CONFIRMED measurements may have begun with an outlier: a
-  candidate that has CONFIRMED since then takes its place.
+- A primary track with fewer than three measurements may have begun with an outlier: a candidate
+  with three since then takes its place.
 - A candidate that is not confirmed gets no measurement near the primary track: else the place of
   an outlier ahead of a neighbor takes the measurements of that neighbor as it passes.
 
@@ -52,7 +52,7 @@ from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutc
 from flock_follower.perception.neighbor_motion import FilterParams
 
 #: A measurement nearer than this to a candidate's expected place is of that candidate, m.
-SAME = 0.3
+SAME_PLACE = 0.3
 #: Tolerance of the distance of a restart, m: errors of both places.
 RESTART_TOLERANCE = 0.3
 #: A candidate has moved if it covers this distance, m, within WINDOW.
@@ -60,7 +60,7 @@ MOVED = 0.5
 #: Time in which a moving candidate covers MOVED, s.
 WINDOW = 5.0
 #: A candidate with fewer measurements may be a false detection.
-CONFIRMED = 3
+N_CONFIRMED = 3
 #: The primary track must be unseen for this long, s, before a candidate can replace it.
 PATIENCE = 10.0
 #: A candidate at rest is kept for this long, s, after its last measurement.
@@ -108,7 +108,7 @@ class Candidate:
     @property
     def confirmed(self) -> bool:
         """Return whether it is more than a false detection."""
-        return self.measured >= CONFIRMED
+        return self.measured >= N_CONFIRMED
 
     @property
     def seen(self) -> float:
@@ -169,14 +169,15 @@ class Hypotheses:
         """Return the candidate that a measurement at a place (3,), m, belongs to, or None."""
         if not self.candidates:
             return None
-        nearest = self._nearest(time, place)
+        nearest = self._find_nearest(time, place)
         expected = self.primary.place(time)
-        least = SAME if expected is None else min(SAME, math.dist(place, expected.translation))
-        if not self._marked and least < SAME and not nearest.confirmed:
+        least = SAME_PLACE if expected is None else min(
+            SAME_PLACE, math.dist(place, expected.translation))
+        if not self._marked and least < SAME_PLACE and not nearest.confirmed:
             return None
         return nearest if nearest.distance(time, place) < least else None
 
-    def _nearest(self, time: float, place: Array) -> Candidate:
+    def _find_nearest(self, time: float, place: Array) -> Candidate:
         return min(self.candidates, key=lambda each: each.distance(time, place))
 
     def take(self, time: float, measured: Transform, reference: Array, covariance: Array,
@@ -198,7 +199,7 @@ class Hypotheses:
                 *arguments, alike)
             if outcome is not UpdateOutcome.OUTLIER:
                 return Taken(outcome)
-            candidate = self._refused(time, measured.translation)
+            candidate = self._choose_candidate(time, measured.translation)
         if time <= candidate.seen:
             return Taken(UpdateOutcome.LATE, candidate)
         candidate.take(*arguments)
@@ -210,11 +211,11 @@ class Hypotheses:
             return Taken(UpdateOutcome.STARTED)
         return Taken(UpdateOutcome.OUTLIER, candidate)
 
-    def _refused(self, time: float, place: Array) -> Candidate:
+    def _choose_candidate(self, time: float, place: Array) -> Candidate:
         """Return the candidate of a measurement (3,), m, that the primary track refused."""
         if not self._marked and self.candidates:
-            nearest = self._nearest(time, place)
-            if nearest.distance(time, place) < SAME:
+            nearest = self._find_nearest(time, place)
+            if nearest.distance(time, place) < SAME_PLACE:
                 return nearest
         return self._add(time, place)
 
@@ -247,7 +248,7 @@ class Hypotheses:
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
         """Return whether a candidate replaces the primary track; see the module."""
         moved, last = candidate.motion.moved, self.primary.newest
-        if not self._marked and self._measured < CONFIRMED <= candidate.alone:
+        if not self._marked and self._measured < N_CONFIRMED <= candidate.alone:
             return True
         if candidate.measured < self.params.max_rejections:
             return False
