@@ -47,6 +47,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import PosePrior
+from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pose import locate, target
 from flock_follower.perception.prints import BORDER_WIDTHS, turned_print, wrong_border
 from flock_follower.perception.search import everywhere
@@ -204,12 +205,15 @@ class Collector:
         seen.frames_topic = config.frames_topic
         mounting = camera_mounting(*(seen.value('relative_pose', name, [0.0, 0.0, 0.0])
                                      for name in ('camera_position', 'camera_rpy')))
+        if all(n.source is None for n in config.neighbors):
+            seen.sources = {}
+            return
         seen.sources = judge_poses(
             config, {n.name: self._poses.get(full_name(n.source.topic, seen.namespace), [])
                      for n in config.neighbors if n.source is not None and n.source.topic},
             seen.own.states if seen.own else [],
             {frame.frame_id: mounting} if frame is not None and frame.frame_id else {},
-            seen.static) if any(n.source is not None for n in config.neighbors) else {}
+            seen.static, seen.value('relative_pose', 'max_wait', MAX_WAIT))
 
     def _measure(self, picture: Picture, pixels: GrayImage, camera: CameraModel | None,
                  found: Detections, config: NeighborConfig, up: Array | None

@@ -137,7 +137,8 @@ class Tracker:
         marked = [n for n in config.neighbors if n.markers]
         self._targets = {n.name: target(n, config.dictionary) for n in marked}
         self._side = {n.name: max(m.side_length for m in n.markers) for n in marked}
-        self._hypotheses = {n.name: Hypotheses(params) for n in config.neighbors}
+        self._hypotheses = {
+            n.name: Hypotheses(params, n.source is None) for n in config.neighbors}
         self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._marked = {n.name: self._filters[n.name] for n in marked}
         self._sources = {n.name: MountedCamera(
