@@ -236,7 +236,8 @@ def test_flight_node_loads_no_checks_bags_or_foreign_tables(node):
 
 def test_no_node_loads_the_tables_of_all():
     assert not [name for name, module in read_house().items()
-                if module.room in ('nodes', 'support') and 'flock_follower.flight_parameters' in loaded(name)]
+                if module.room in ('nodes', 'support')
+                and 'flock_follower.flight_parameters' in loaded(name)]
 
 
 def test_the_law_loads_geometry_and_ranges_alone():
