@@ -23,6 +23,7 @@ from __future__ import annotations
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 import subprocess
@@ -158,7 +159,9 @@ def room_of(name: str, path: Path) -> str:
     return own if package == 'flock_follower' or own in ROOMS else package
 
 
+@cache
 def read_house() -> dict[str, Module]:
+    """Return the modules by name; the first test reads them, not every worker that loads this."""
     names, house = module_names(), {}
     for name, path in names.items():
         house[name] = Module(room_of(name, path), set(), set())
@@ -172,9 +175,6 @@ def read_house() -> dict[str, Module]:
     return house
 
 
-HOUSE = read_house()
-
-
 def loaded(name: str) -> set[str]:
     """Return the modules of the packages that Python loads with one of them."""
     found, waiting = set(), [name]
@@ -182,15 +182,13 @@ def loaded(name: str) -> set[str]:
         module = waiting.pop()
         if module not in found:
             found.add(module)
-            waiting += HOUSE[module].ours
+            waiting += read_house()[module].ours
             if '.' in module:  # the packages around it
                 waiting.append(module.rpartition('.')[0])
     return found
 
 
-ROOM_NAMES = sorted({module.room for module in HOUSE.values()} - SHARED - {'flock_follower'})
-
-
+@cache
 def arrows() -> dict[tuple[str, str], list[str]]:
     """
     Return which modules of one room import from another one.
@@ -198,31 +196,29 @@ def arrows() -> dict[tuple[str, str], list[str]]:
     The ``__init__.py`` of a folder around a module is left out: Python loads it in any case.
     """
     found = defaultdict(list)
-    for name, module in HOUSE.items():
+    for name, module in read_house().items():
         for target in module.ours:
-            room = HOUSE[target].room
+            room = read_house()[target].room
             if room != module.room and not name.startswith(f'{target}.'):
                 found[module.room, room].append(f'{name} -> {target}')
     return dict(found)
 
 
-ARROWS = arrows()
-
-
 def test_every_room_is_on_the_plan_and_no_other():
-    assert sorted(ROOMS) == ROOM_NAMES
+    rooms = {module.room for module in read_house().values()}
+    assert sorted(ROOMS) == sorted(rooms - SHARED - {'flock_follower'})
 
 
 @pytest.mark.parametrize('room', sorted(ROOMS))
 def test_a_room_imports_only_what_it_may(room):
     may = {*ROOMS[room][0].split()} | SHARED
-    assert not [arrow for (source, target), modules in ARROWS.items()
+    assert not [arrow for (source, target), modules in arrows().items()
                 if source == room and target not in may for arrow in modules]
 
 
 @pytest.mark.parametrize('room', sorted(ROOMS))
 def test_a_room_uses_only_the_libraries_it_may(room):
-    for name, module in HOUSE.items():
+    for name, module in read_house().items():
         if module.room == room:
             used = {'ROS' if is_ros(library) else library
                     for library in module.libraries - sys.stdlib_module_names}
@@ -230,20 +226,21 @@ def test_a_room_uses_only_the_libraries_it_may(room):
 
 
 def test_what_flies_imports_nothing_of_the_desk():
-    assert not [f'{name} -> {target}' for name, module in HOUSE.items() for target in module.ours
+    assert not [f'{name} -> {target}' for name, module in read_house().items()
+                for target in module.ours
                 if name.startswith('flock_follower') and target.startswith('flock_desk')]
 
 
 def test_no_rooms_import_each_other_in_a_circle():
     graph = defaultdict(set)
-    for source, target in ARROWS:
+    for source, target in arrows():
         graph[source].add(target)
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 @pytest.mark.parametrize('node', FLIES)
 def test_a_node_that_flies_loads_only_the_libraries_it_may(node):
-    libraries = set().union(*(HOUSE[name].libraries
+    libraries = set().union(*(read_house()[name].libraries
                               for name in loaded(f'flock_follower.nodes.{node}')))
     assert {'ROS' if is_ros(library) else library
             for library in libraries - sys.stdlib_module_names} == {*FLIES[node].split()}
@@ -251,13 +248,13 @@ def test_a_node_that_flies_loads_only_the_libraries_it_may(node):
 
 @pytest.mark.parametrize('node', FLIES)
 def test_a_flight_node_loads_only_the_rooms_of_its_work(node):
-    rooms = {HOUSE[name].room for name in loaded(f'flock_follower.nodes.{node}')}
+    rooms = {read_house()[name].room for name in loaded(f'flock_follower.nodes.{node}')}
     assert rooms - SHARED - {'flock_follower'} == {*LOADED_ROOMS[node].split()}
 
 
 def test_the_bridge_loads_only_the_limits_of_the_planner():
     of_planner = {name for name in loaded('flock_follower.nodes.mavlink_bridge')
-                  if HOUSE[name].room == 'planner'}
+                  if read_house()[name].room == 'planner'}
     assert of_planner == LIMITS
 
 
@@ -276,7 +273,8 @@ def test_a_flight_node_loads_no_more_than_now(node):
 
 
 def test_no_node_loads_the_tables_of_all():
-    assert not [name for name, module in HOUSE.items() if module.room in ('nodes', 'support')
+    assert not [name for name, module in read_house().items()
+                if module.room in ('nodes', 'support')
                 and 'flock_follower.flight_parameters' in loaded(name)]
 
 
