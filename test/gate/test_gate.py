@@ -207,6 +207,50 @@ def test_displacement_mismatch_brakes_and_hands_over(
     assert other in decision.reason and other in gate.handover(now)
 
 
+def test_a_height_that_jumps_is_no_displacement_of_odometry():
+    gate = fresh_gate()
+    for now in np.arange(10.0, 20.0, 0.05):
+        gate.take_motion('odom', MotionReport([0.0, 0.0, 0.0], 0.5, np.zeros(3)), 0.0, now)
+        gate.take_height(2.0 if now < 14.0 else 3.5, now)  # a wall below, or a door
+        gate.take_command(Command(FORWARD, 1.0), 0.0, now)
+        decision = decide(gate, now)
+        assert gate.handover(now) == ''
+    assert gate.heights.stepped > 14.0 and decision.kind == 'command'
+
+
+def along(gate, source, start, velocity, begin, seconds, offset=0.0):
+    """Fly along x by a source's positions; return the last of them, m, and its time, s."""
+    for now in np.arange(begin, begin + seconds, 0.05):
+        x = start + velocity * (now - begin)
+        gate.take_motion(source, MotionReport(
+            [velocity, 0.0, 0.0], 0.0, [x - offset, 0.0, 2.0]), 0.0, now)
+        decide(gate, now)
+    return x, now
+
+
+@pytest.mark.parametrize(('pause', 'velocity'), [(0.1, 0.5), (0.6, 0.5), (2.9, 0.0), (2.9, 0.5)])
+def test_odometry_that_starts_anew_at_zero_does_not_restart_the_radius(pause, velocity):
+    gate = fly(Gate(LIMITS), 10.0)
+    x, now = along(gate, 'odom', 0.0, 1.0, 10.0, 30.0)
+    along(gate, 'odom', x, velocity, now + pause, 1.0, offset=x)
+    assert gate.place(now + pause).offset[0] == pytest.approx(x + velocity * (pause + 1.0), abs=1.5)
+
+
+def test_motion_while_odometry_pauses_is_no_jump():
+    gate = fly(Gate(LIMITS), 10.0)
+    x, now = along(gate, 'odom', 0.0, 2.0, 10.0, 5.0)
+    # It brakes by 2 m/s^2.
+    along(gate, 'odom', x + 1.0, 0.0, now + 1.5, 0.2)
+    assert gate.place(now + 1.5).offset[0] == pytest.approx(x + 1.0)
+
+
+def test_odometry_that_comes_in_flight_keeps_the_radius_by_the_autopilot():
+    gate = fly(Gate(LIMITS), 10.0)
+    x, now = along(gate, 'autopilot', 100.0, 1.0, 10.0, 20.0)
+    x, now = along(gate, 'odom', x, 1.0, now + 0.05, 5.0, offset=500.0)
+    assert gate.place(now).offset[0] == pytest.approx(x - 100.0, abs=0.1)
+
+
 def test_command_is_accepted_only_while_active():
     gate = Gate(LIMITS)
     assert gate.take_motion('odom', MotionReport((0.1, 0.0, 0.0)), 0.0, 10.0) == ''
