@@ -356,8 +356,9 @@ class Bridge:
         Send the final messages.
 
         A vehicle that still flies our setpoints receives a hold command, or the land command again
-        if a landing is pending; none while its mode is unknown. The last message is a level setpoint, because autopilots obey it
-        for up to seconds: after that time a braking one would make the vehicle fly backwards.
+        if a landing is pending; none while its mode is unknown. The last message is a level
+        setpoint, because autopilots obey it for up to seconds: after that time a braking one would
+        make the vehicle fly backwards.
         """
         if self.telemetry.dialect is not None and self.gate.flies and (
                 self.status(now) is not None):  # else the pilot may have taken over

@@ -167,7 +167,7 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = Altitude.begin(me, None if jumped else ground, params) if (
-        memory.altitude is None) else memory.altitude.bounded(params)
+        memory.altitude is None) else memory.altitude.with_limits_of(params)
     level = neighbors.level
     if level is None and missed is not None and not scene.blinded:
         level = expected_now(missed, memory, me.stamp, params)

@@ -83,7 +83,7 @@ class Altitude(NamedTuple):
         low, high = _within_limits(ground, params)
         return cls(z, min(low, z), max(high, z), ground=ground, limits=limits)
 
-    def bounded(self, params: PlannerParams) -> Altitude:
+    def with_limits_of(self, params: PlannerParams) -> Altitude:
         """Return it with the bounds of parameters that have changed in flight."""
         limits = params.altitude_min, params.altitude_max
         if self.limits is None or limits == self.limits:

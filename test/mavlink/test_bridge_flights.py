@@ -114,7 +114,7 @@ def test_a_pilot_who_took_over_on_a_dead_line_is_left_alone(personality, ends):
 
 
 @BOTH
-def test_a_bridge_restarted_during_a_take_off_counts_heights_from_home(personality):
+def test_bridge_restarted_in_a_take_off_knows_its_height(personality):
     flight = Flight(personality, start='armed', parameters={'MIS_TAKEOFF_ALT': 8.0} if (
         personality == 'px4') else {})
     flight.fly(7.0)

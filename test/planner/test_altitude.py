@@ -156,10 +156,10 @@ def test_bounds_that_change_in_flight_count_at_once(
         ground: float | None, begun: float, changes: dict[str, float], lowest: float,
         highest: float) -> None:
     altitude, params = Altitude.begin(me(begun), ground, PARAMS), replace(PARAMS, **changes)
-    assert altitude.bounded(PARAMS) is altitude
-    bounded = altitude.bounded(params)
+    assert altitude.with_limits_of(PARAMS) is altitude
+    bounded = altitude.with_limits_of(params)
     assert (bounded.lowest, bounded.highest) == pytest.approx((lowest, highest))
-    assert bounded.bounded(params) is bounded
+    assert bounded.with_limits_of(params) is bounded
 
 
 def test_a_ceiling_lowered_in_flight_is_obeyed() -> None:
