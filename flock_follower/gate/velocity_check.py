@@ -378,8 +378,9 @@ class Source:
         """Standard deviation of the position, m."""
 
     def take_velocity(self, velocity: Array, time: float) -> None:
-        """Take a velocity (3,), m/s, at a time, s."""
-        self.velocity, self.velocity_time = velocity, time
+        """Take a velocity (3,), m/s, at a time, s; one that comes late replaces no newer one."""
+        if time >= self.velocity_time:
+            self.velocity, self.velocity_time = velocity, time
 
     def take_position(self, position: ArrayLike | None, time: float, std: float,
                       max_age: float) -> None:

@@ -207,15 +207,28 @@ def test_displacement_mismatch_brakes_and_hands_over(
     assert other in decision.reason and other in gate.handover(now)
 
 
-def test_a_height_that_jumps_is_no_displacement_of_odometry():
-    gate = fresh_gate()
+@pytest.mark.parametrize(('height', 'climb', 'end'), [
+    (1.5, 0.0, ''),  # a wall below, or a door
+    (0.0, 2.5, 'displacements')])
+def test_a_jump_of_the_sensor_alone_is_no_displacement(height, climb, end):
+    gate, handovers = fresh_gate(), []
     for now in np.arange(10.0, 20.0, 0.05):
-        gate.take_motion('odom', MotionReport([0.0, 0.0, 0.0], 0.5, np.zeros(3)), 0.0, now)
-        gate.take_height(2.0 if now < 14.0 else 3.5, now)  # a wall below, or a door
+        later = max(now - 14.0, 0.0)
+        gate.take_motion('odom', MotionReport(
+            [0.0, 0.0, climb * (later > 0.0)], 0.5, [0.0, 0.0, climb * later]), 0.0, now)
+        gate.take_height(2.0 + height * (later > 0.0), now)
         gate.take_command(Command(FORWARD, 1.0), 0.0, now)
-        decision = decide(gate, now)
-        assert gate.handover(now) == ''
-    assert gate.heights.stepped > 14.0 and decision.kind == 'command'
+        decide(gate, now)
+        handovers.append(gate.handover(now))
+    assert gate.heights.stepped > 14.0
+    assert next(filter(None, handovers), '').startswith(end) and bool(end) == any(handovers)
+    assert not any(handovers[:81])
+
+
+def test_a_velocity_that_comes_late_replaces_no_newer_one():
+    gate = fresh_gate()
+    assert gate.take_motion('odom', MotionReport((0.9, 0.0, 0.0)), 0.2, 10.0) == ''
+    assert gate.speed(10.0) == pytest.approx(0.1)
 
 
 def along(gate, source, start, velocity, begin, seconds, offset=0.0):
