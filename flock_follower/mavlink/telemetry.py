@@ -58,6 +58,10 @@ LANDED_OLDEST: Final[float] = 3.0
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: The autopilot has rebooted if stamps of two consecutive attitudes go back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
+#: Stamps wrap at 2**32 ms, after 50 days: from at most this long before to as long after it, ms.
+WRAP_MARGIN_MS: Final[int] = 60_000
+#: ``signal_quality`` of a DISTANCE_SENSOR without a valid distance; 0 is unknown.
+_INVALID_DISTANCE: Final[int] = 1
 _FLYING: Final[dict[int, bool]] = {
     mavlink.MAV_LANDED_STATE_ON_GROUND: False, mavlink.MAV_LANDED_STATE_TAKEOFF: False,
     mavlink.MAV_LANDED_STATE_IN_AIR: True, mavlink.MAV_LANDED_STATE_LANDING: True}
@@ -273,6 +277,7 @@ class Telemetry:
         known = self.sensor_altitude
         if message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270 and (
                 message.min_distance <= message.current_distance <= message.max_distance) and (
+                    message.signal_quality != _INVALID_DISTANCE) and (
                     known is None or known.source == 'DISTANCE_SENSOR'):
             self.sensor_altitude = SensorAltitude(
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
@@ -284,6 +289,8 @@ class Telemetry:
 
     def _notice_reboot(self, stamp: int) -> None:
         """Compare the stamp of an attitude, ms since boot, with the newest; 0: not set."""
+        if self._boot_time_ms >= 2**32 - WRAP_MARGIN_MS and 0 < stamp < WRAP_MARGIN_MS:
+            self._boot_time_ms = stamp
         fallen = 0 < stamp < self._boot_time_ms - REBOOT_STEP_MS
         if fallen and self._fallen:  # a single one may have been delayed
             self.reboots += 1

@@ -198,8 +198,9 @@ class Planner(FlockNode):
             self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
 
     def _take_frame(self, message: Header, arrival: int) -> None:
-        if self._loop.take_frame(arrival - self._even_clock.shift,
-                                 stamp_to_nanoseconds(message.stamp)):
+        # Compared with the stamps of neighbors: on the same clock.
+        stamp = self._even_clock.dated(stamp_to_nanoseconds(message.stamp), arrival)
+        if self._loop.take_frame(arrival - self._even_clock.shift, stamp):
             timeout = round(self._settings.current.perception_timeout * 1e9)
             late = self.get_clock().now().nanoseconds - arrival
             # Within the timeout, if the clock was set meanwhile.

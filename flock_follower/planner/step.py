@@ -166,7 +166,8 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,
     me, coming = me._replace(velocity=me.velocity + flown), float(memory.pending[2])
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
-    altitude = memory.altitude or Altitude.begin(me, None if jumped else ground, params)
+    altitude = Altitude.begin(me, None if jumped else ground, params) if (
+        memory.altitude is None) else memory.altitude.with_limits_of(params)
     level = neighbors.level
     if level is None and missed is not None and not scene.blinded:
         level = expected_now(missed, memory, me.stamp, params)
