@@ -139,7 +139,7 @@ class Perceiver:
         known = self._cameras[camera]
         known.frame = message.header.frame_id
         if known.frame:
-            self.sources.frames[known.frame] = self.tracker.cameras[camera].T_body_camera
+            self.sources.frames[known.frame.lstrip('/')] = self.tracker.cameras[camera].T_body_camera
         if calibration == known.calibration:
             return False
         known.model, known.calibration = None, ()

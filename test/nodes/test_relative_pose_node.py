@@ -339,7 +339,10 @@ def test_the_child_frame_of_odom_is_placed_by_tf_static(
     imu.header.frame_id = 'base_link'
     set_vector(imu.transform.translation, T_base_imu.translation)
     set_quaternion(imu.transform.rotation, T_base_imu.quaternion)
-    r.node._own._static.take(SimpleNamespace(transforms=[imu]))
+    wrong = TransformStamped(child_frame_id='lidar')  # it does not cost the other
+    wrong.transform.rotation.w = 0.0
+    with pytest.raises(ValueError, match='quaternion'):
+        r.node._own._static.take(SimpleNamespace(transforms=[wrong, imu]))
     T_odom_imu = OWN @ T_base_imu
     r.give('odom', to_odometry(nanoseconds_to_stamp(START), 'odom', 'imu', T_odom_imu.translation,
                                T_odom_imu.quaternion, np.zeros(3)))

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
@@ -43,6 +43,22 @@ LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 def best_effort(depth: int = 1) -> QoSProfile:
     """Return the QoS that takes what reliable and best-effort publishers send alike."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def for_each(messages: Iterable[Any], take: Callable[[Any], None]) -> None:
+    """
+    Take each of several messages.
+
+    :raises ValueError: the first that ``take`` raised; all others are taken.
+    """
+    invalid: ValueError | None = None
+    for message in messages:
+        try:
+            take(message)
+        except ValueError as error:
+            invalid = invalid or error
+    if invalid is not None:
+        raise invalid
 
 
 class NodeClock(Protocol):
@@ -72,12 +88,18 @@ class StaticChild:
             depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def take(self, message: Any) -> None:
-        """Take a TFMessage."""
-        for stamped in message.transforms:
-            turn = stamped.transform.rotation
-            self.frames.add(
-                stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
-                    to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
+        """
+        Take a TFMessage.
+
+        :raises ValueError: if a transform is invalid; the others are taken.
+        """
+        for_each(message.transforms, self._add)
+
+    def _add(self, stamped: Any) -> None:
+        turn = stamped.transform.rotation
+        self.frames.add(
+            stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
+                to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
 
     def transform(self, child: str) -> Transform | None:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""
