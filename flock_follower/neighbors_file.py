@@ -70,7 +70,7 @@ import yaml
 
 from flock_follower.files import read_text
 from flock_follower.geometry import quaternion_from_rpy, Transform
-from flock_follower.ranges import Range, suggestion
+from flock_follower.ranges import check_topic, Range, suggestion, WORDS
 
 #: Number of markers of OpenCV's dictionaries: ids run from 0 to one less.
 DICTIONARY_SIZES: Final[Mapping[str, int]] = {
@@ -95,11 +95,8 @@ _SOURCES = {'pose_topic', 'tf_frame'}
 _SOURCE_KEYS = {'position_std', 'attitude_std', 'position_only'}
 ROLES = ('leader', 'follower', 'avoid')
 _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
-_TOKENS = '[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*'
-#: Of a topic, relative, absolute or private.
-_TOPIC = re.compile(f'(/|~/)?{_TOKENS}')
 #: Of a neighbor: it is a part of topics, and the frame on ``/tf``.
-_NAME = re.compile(f'(?!.*/duplicate){_TOKENS}')
+_NAME = re.compile(f'(?!.*/duplicate){WORDS}')
 _LONGEST_NAME = 100  # characters; ROS takes 247 for a whole topic
 #: Frames of the own vehicle, which a neighbor would replace on ``/tf``.
 _OWN_FRAMES = ('base_link', 'map', 'odom')
@@ -225,7 +222,7 @@ def parse(document: Any,
                       for where, entry in _entries('neighbors', document['neighbors']))
     frames_topic = document.get('frames_topic', '')
     if frames_topic != '':
-        frames_topic = _topic('frames_topic', frames_topic)
+        check_topic('frames_topic', frames_topic)
     if frames_topic and any(neighbor.markers for neighbor in neighbors):
         raise ValueError(f'frames_topic = {frames_topic!r}: remove it: with markers, the images '
                          'show which frames are processed')
@@ -284,16 +281,11 @@ def _parse_source(where: str, key: str, entry: Mapping[str, Any]) -> PoseSource:
             deviations[name] = float(entry[name])
         elif key == 'tf_frame' and not (only and name == 'attitude_std'):
             raise ValueError(f'{where} lacks {name}: transforms have no covariance')
-    place = f'{where}.{key}', entry[key]
-    topic, frame = ('', _frame(*place)) if key == 'tf_frame' else (_topic(*place), '')
+    topic, frame = ('', _frame(f'{where}.{key}', entry[key])) if key == 'tf_frame' else (
+        entry[key], '')
+    if not frame:
+        check_topic(f'{where}.{key}', topic)
     return PoseSource(topic, frame, deviations.get('position_std'), deviations.get('attitude_std'), only)
-
-
-def _topic(where: str, value: Any) -> str:
-    if not isinstance(value, str) or not _TOPIC.fullmatch(value):
-        raise ValueError(f'{where} = {value!r}: must be the name of a topic: words of letters, '
-                         'digits and _ with / between them')
-    return value
 
 
 def _frame(where: str, value: Any) -> str:

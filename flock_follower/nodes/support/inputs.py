@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from contextlib import suppress
 from typing import Any, Protocol
 
 from nav_msgs.msg import Odometry
@@ -82,10 +82,12 @@ class StaticChild:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
             return
-        subscribe = (partial(node.subscribe, required=False, largest=TRANSFORMS_BYTES_MAX)
-                     if isinstance(node, FlockNode) else node.create_subscription)
-        subscribe(TFMessage, '/tf_static', self.take, QoSProfile(
-            depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        if isinstance(node, FlockNode):
+            node.subscribe(TFMessage, '/tf_static', self.take, qos, required=False,
+                           largest=TRANSFORMS_BYTES_MAX)
+        else:
+            node.create_subscription(TFMessage, '/tf_static', self._take_valid, qos)
 
     def take(self, message: Any) -> None:
         """
@@ -94,6 +96,11 @@ class StaticChild:
         :raises ValueError: if a transform is invalid; the others are taken.
         """
         for_each(message.transforms, self._add)
+
+    def _take_valid(self, message: Any) -> None:
+        """Take the valid transforms of a TFMessage: for a node that no callback may end."""
+        with suppress(ValueError):
+            self.take(message)
 
     def _add(self, stamped: Any) -> None:
         turn = stamped.transform.rotation
