@@ -194,7 +194,8 @@ class _Loader(yaml.SafeLoader):
         known: set[str] = set()
         for key, _ in node.value:
             # Keys that ``<<`` merges in are from elsewhere, and may be given anew.
-            if not isinstance(key, yaml.ScalarNode) or key.start_mark.index < node.start_mark.index:
+            own = key.start_mark.index >= node.start_mark.index
+            if not own or not isinstance(key, yaml.ScalarNode):
                 continue
             if key.value in known:
                 raise ValueError(f'line {key.start_mark.line + 1}: {key.value} is given twice: '
@@ -285,7 +286,8 @@ def _parse_source(where: str, key: str, entry: Mapping[str, Any]) -> PoseSource:
         entry[key], '')
     if not frame:
         check_topic(f'{where}.{key}', topic)
-    return PoseSource(topic, frame, deviations.get('position_std'), deviations.get('attitude_std'), only)
+    return PoseSource(topic, frame, deviations.get('position_std'),
+                      deviations.get('attitude_std'), only)
 
 
 def _frame(where: str, value: Any) -> str:

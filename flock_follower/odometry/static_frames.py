@@ -35,8 +35,8 @@ class StaticFrames:
         :raises ValueError: if its translation is not finite, or beyond ``SANE``.
         """
         if not np.all(np.abs(T_parent_child.translation) <= SANE):  # NaN fails
-            raise ValueError(f'{child} in {parent}: {T_parent_child.translation.tolist()}: must be '
-                             f'finite, and within {SANE:g} m')
+            raise ValueError(f'{child} in {parent}: {T_parent_child.translation.tolist()}: must '
+                             f'be finite, and within {SANE:g} m')
         self._parents[child] = parent, T_parent_child
 
     def pose(self, frame: str, on: str) -> Transform | None:

@@ -85,8 +85,8 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     """
     Return the cameras in the checked values of a node's parameters.
 
-    :raises ValueError: if a topic is none, if two cameras share a name or a topic, or if a parameter of a single
-        camera is set beside several cameras.
+    :raises ValueError: if a topic is none, if two cameras share a name or a topic, or if a
+        parameter of a single camera is set beside several cameras.
     """
     names = [name for name in values[NAMES] if name]
     if not names:

@@ -139,7 +139,8 @@ class Perceiver:
         known = self._cameras[camera]
         known.frame = message.header.frame_id
         if known.frame:
-            self.sources.frames[known.frame.lstrip('/')] = self.tracker.cameras[camera].T_body_camera
+            mounting = self.tracker.cameras[camera].T_body_camera
+            self.sources.frames[known.frame.lstrip('/')] = mounting
         if calibration == known.calibration:
             return False
         known.model, known.calibration = None, ()

@@ -146,9 +146,10 @@ class PoseSources:
         frame = state.frame.lstrip('/')
         T_body_frame = self._mounting(frame)
         if T_body_frame is None and (not frame or frame != odom_frame.lstrip('/')):
+            expected = odom_frame or 'that of the odometry'
             return UNKNOWN_FRAME, (
-                f'{name}: frame {frame!r}: must be {odom_frame or "that of the odometry"}, {BASE}, a frame connected to it '
-                f'by tf_static, or of a camera: {", ".join(self.frames) or "no camera_info yet"}')
+                f'{name}: frame {frame!r}: must be {expected}, {BASE}, a frame connected to it by '
+                f'tf_static, or of a camera: {", ".join(self.frames) or "no camera_info yet"}')
         nearest, farthest = (0.0, SANE) if T_body_frame is None else (NEAREST, FARTHEST)
         if not nearest <= math.hypot(*state.position.tolist()) <= farthest:  # NaN fails
             return INVALID, f'{name}: position {state.position.tolist()}'

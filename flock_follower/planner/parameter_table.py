@@ -26,7 +26,6 @@ from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.cameras import ANGLES, CAMERA_SPECS, cameras, DEFAULT_RPY
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.planner.params import Member, PlannerParams
-from flock_follower.ranges import Range
 from flock_follower.settings import refuse
 
 PLANNER = [

@@ -238,7 +238,7 @@ def test_topic_of_the_poses_is_not_that_of_the_frames() -> None:
         parse({'frames_topic': 'x', 'neighbors': [{'name': 'leader', 'pose_topic': 'x'}]})
 
 
-def test_odometry_without_a_frame_places_poses_in_frames_of_the_body() -> None:
+def test_poses_of_the_body_need_no_frame_of_odometry() -> None:
     perceiver = started()
     for k in range(101):
         nameless = pose(k * 0.01, 'odom')
