@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import math
 from typing import NamedTuple
 
@@ -117,6 +117,12 @@ class PoseSources:
         self._wait = ObservedWait(max_wait, 1.0, needed=1)  # of frames for their poses
         self.restart()
 
+    def place_cameras(self, placed: Iterable[tuple[str, Transform]]) -> None:
+        """Take frame and pose on the body of each camera; a frame of two cameras is of neither."""
+        placed = [each for each in placed if each[0]]
+        names = [name for name, _ in placed]
+        self.frames = {name: pose for name, pose in placed if names.count(name) == 1}
+
     def restart(self) -> None:
         """Forget all that waits."""
         self._newest = dict.fromkeys(self.sources, -math.inf)
@@ -144,8 +150,11 @@ class PoseSources:
         if not max(newest - OLDEST_POSE, self._newest[name]) < stamp <= newest + AHEAD_OF_ODOMETRY:
             return UNTIMELY, f'{name}: {stamp - newest:.2f} s after the odometry'
         frame = state.frame.lstrip('/')
-        T_body_frame = self._mounting(frame)
-        if T_body_frame is None and (not frame or frame != odom_frame.lstrip('/')):
+        odom, T_body_frame = odom_frame.lstrip('/'), self._mounting(frame)
+        if frame in self.frames and frame in (BASE, odom):
+            return UNKNOWN_FRAME, (f'{name}: frame {frame!r} is also that of a camera, whose axes '
+                                   'are others: camera_info must have a frame of its own')
+        if T_body_frame is None and (not frame or frame != odom):
             expected = odom_frame or 'that of the odometry'
             return UNKNOWN_FRAME, (
                 f'{name}: frame {frame!r}: must be {expected}, {BASE}, a frame connected to it by '

@@ -189,6 +189,12 @@ def test_a_topic_of_another_type_is_reported(
     assert 'holds std_msgs/msg/String' in rig().problems()
 
 
+def test_topic_of_frames_without_a_header_is_reported(
+        rig: Callable[..., Rig], ends: dict[str, list[str]]) -> None:
+    ends['/camera_info'] = ['std_msgs/msg/String']
+    assert 'frames_topic /camera_info holds std_msgs/msg/String' in rig().problems()
+
+
 def test_a_transform_needs_tf2_msgs(rig: Callable[..., Rig]) -> None:
     try:
         import tf2_msgs.msg  # type: ignore[import-not-found]  # noqa: F401

@@ -30,6 +30,7 @@ from flock_follower.neighbors_file import NeighborConfig, parse, PoseSource
 from flock_follower.perception import pose_sources
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import Sourced
+from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseState
 
@@ -236,6 +237,26 @@ def test_one_source_is_of_one_neighbor(key: str) -> None:
 def test_topic_of_the_poses_is_not_that_of_the_frames() -> None:
     with pytest.raises(ValueError, match=r'neighbors\[0\]\.pose_topic = .*frames_topic'):
         parse({'frames_topic': 'x', 'neighbors': [{'name': 'leader', 'pose_topic': 'x'}]})
+
+
+@pytest.mark.parametrize(('frames', 'known'), [
+    (('left', '/right'), True), (('right', 'right'), False), (('left', 'base_link'), False),
+    (('odom', 'right'), False)])
+def test_frame_with_two_meanings_is_not_guessed(frames: tuple[str, str], known: bool) -> None:
+    """A detector copies the frame of its images: two cameras may share one, or name the body's."""
+    turned = Transform(MOUNTING.rotation @ np.diag([-1.0, 1.0, -1.0]), MOUNTING.translation)
+    perceiver = Perceiver(Tracker(config(), {
+        'left': MountedCamera(turned), 'right': MountedCamera(MOUNTING)}), max_wait=0.35)
+    for name, frame in zip(('left', 'right'), frames):
+        calibration = empty('sensor_msgs/msg/CameraInfo')
+        calibration.header.frame_id = frame
+        with pytest.raises(ValueError, match='not calibrated'):
+            perceiver.take_camera_info(calibration, name)
+    seconds(perceiver, 0.0, 1.0)
+    named = frames[0] if frames[0] == 'odom' else frames[1]
+    refused = perceiver.take_pose('leader', pose(0.5)._replace(frame=named), 0.0)
+    assert (refused is None) == known
+    assert known or (refused and refused[0] == pose_sources.UNKNOWN_FRAME)
 
 
 def test_poses_of_the_body_need_no_frame_of_odometry() -> None:

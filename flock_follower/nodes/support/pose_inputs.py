@@ -27,7 +27,7 @@ from rclpy.qos import QoSProfile
 
 from flock_follower.messages import stamp_age
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.diagnostics import Problem, STEADY, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import (
     best_effort,
     for_each,
@@ -74,6 +74,8 @@ class PoseInputs:
         self._contested: set[str] = set()
         """Topics with several publishers: their poses are refused."""
         self._subscribed: set[str] = set()
+        self._frames_fault = ''
+        """Why the topic of the frames cannot be used, or ''."""
         frames = perceiver.tracker.config.frames_topic
         self._frames = node.resolve_topic_name(frames) if frames else ''
         topics = [node.resolve_topic_name(s.topic) for s in sources.values() if s.topic]
@@ -115,7 +117,11 @@ class PoseInputs:
             self._subscribed.add(topic)
         if self._frames and self._frames not in self._subscribed:
             for end in self._node.get_publishers_info_by_topic(self._frames):
-                self._subscribe_frames(end.topic_type)
+                try:
+                    self._subscribe_frames(end.topic_type)
+                    self._frames_fault = ''
+                except ValueError as error:
+                    self._frames_fault = str(error)
                 break
 
     def _subscribe_frames(self, msgtype: str) -> None:
@@ -166,6 +172,8 @@ class PoseInputs:
         self._judged[outcome.name].append((stamp_age(outcome.stamp, now), refused))
 
     def _problem(self, now: float) -> Problem | None:
+        if self._frames_fault:
+            return ERROR, self._frames_fault
         for topic, reason in self._waiting.items():
             if reason:
                 return WARN, f'poses of {self._names[topic]} are not used: {topic}: {reason}'
