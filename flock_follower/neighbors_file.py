@@ -19,7 +19,7 @@ A file holds the dictionary of the markers and a list of neighbors::
 
     dictionary: DICT_4X4_50
     neighbors:
-      - name: leader             # child_frame_id of its estimates
+      - name: leader             # child_frame_id of its estimates: letters, digits and _
         marker_id: 0
         side_length: 0.16        # m, outer edge to outer edge of the black border
         position: [-0.20, 0.0, 0.0]         # marker center on the neighbor's body (FLU), m
