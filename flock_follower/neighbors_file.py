@@ -19,7 +19,7 @@ A file holds the dictionary of the markers and a list of neighbors::
 
     dictionary: DICT_4X4_50
     neighbors:
-      - name: leader             # child_frame_id of its estimates
+      - name: leader             # child_frame_id of its estimates: letters, digits and _
         marker_id: 0
         side_length: 0.16        # m, outer edge to outer edge of the black border
         position: [-0.20, 0.0, 0.0]         # marker center on the neighbor's body (FLU), m
@@ -63,13 +63,14 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
+import re
 from typing import Any, Final
 
 import yaml
 
 from flock_follower.files import read_text
 from flock_follower.geometry import quaternion_from_rpy, Transform
-from flock_follower.ranges import Range, suggestion
+from flock_follower.ranges import check_topic, Range, suggestion, WORDS
 
 #: Number of markers of OpenCV's dictionaries: ids run from 0 to one less.
 DICTIONARY_SIZES: Final[Mapping[str, int]] = {
@@ -94,6 +95,11 @@ _SOURCES = {'pose_topic', 'tf_frame'}
 _SOURCE_KEYS = {'position_std', 'attitude_std', 'position_only'}
 ROLES = ('leader', 'follower', 'avoid')
 _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
+#: Of a neighbor: it is a part of topics, and the frame on ``/tf``.
+_NAME = re.compile(f'(?!.*/duplicate){WORDS}')
+_LONGEST_NAME = 100  # characters; ROS takes 247 for a whole topic
+#: Frames of the own vehicle, which a neighbor would replace on ``/tf``.
+_OWN_FRAMES = ('base_link', 'map', 'odom')
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +179,29 @@ def load(path: str | Path,
     """
     text = read_text(path)
     try:
-        return parse(yaml.safe_load(text), dictionary_size)
+        return parse(yaml.load(text, _Loader), dictionary_size)
     except yaml.YAMLError as error:
         raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads YAML, and refuses a key that is given twice: the first value would be ignored."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """Return a mapping."""
+        known: set[str] = set()
+        for key, _ in node.value:
+            # Keys that ``<<`` merges in are from elsewhere, and may be given anew.
+            own = key.start_mark.index >= node.start_mark.index
+            if not own or not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in known:
+                raise ValueError(f'line {key.start_mark.line + 1}: {key.value} is given twice: '
+                                 'remove one')
+            known.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def parse(document: Any,
@@ -188,25 +212,31 @@ def parse(document: Any,
     :param dictionary_size: see :func:`load`.
     :raises ValueError: naming the key, its value and the valid range.
     """
-    marked = not isinstance(document, Mapping) or 'dictionary' in document or not any(
-        isinstance(each, Mapping) and _SOURCES & {*each} for each in document.get('neighbors', ()))
+    entries = document.get('neighbors') if isinstance(document, Mapping) else None
+    marked = not isinstance(entries, list) or 'dictionary' in document or not any(
+        isinstance(each, Mapping) and _SOURCES & {*each} for each in entries)
     _check_keys('the document', document, {'neighbors'} | ({'dictionary'} if marked else set()),
                 {'frames_topic'})
     dictionary = str(document['dictionary']) if marked else ''
     ids = Range(0, dictionary_size(dictionary) - 1, whole=True) if marked else None
     neighbors = tuple(_parse_neighbor(where, entry, ids)
                       for where, entry in _entries('neighbors', document['neighbors']))
-    frames_topic = _name('frames_topic', document.get('frames_topic', ''))
+    frames_topic = document.get('frames_topic', '')
+    if frames_topic != '':
+        check_topic('frames_topic', frames_topic)
     if frames_topic and any(neighbor.markers for neighbor in neighbors):
         raise ValueError(f'frames_topic = {frames_topic!r}: remove it: with markers, the images '
                          'show which frames are processed')
-    taken: set[object] = set()
+    taken: set[tuple[str, object]] = {('pose_topic', frames_topic)}
     for i, neighbor in enumerate(neighbors):
-        for key, value in (('name', neighbor.name),
+        source = neighbor.source or PoseSource()
+        for key, value in (('name', neighbor.name), ('pose_topic', source.topic),
+                           ('tf_frame', source.tf_frame),
                            *(('marker_id', marker.marker_id) for marker in neighbor.markers)):
-            if value in taken:
-                raise ValueError(f'neighbors[{i}].{key} = {value!r}: must be unique')
-            taken.add(value)
+            if value != '' and (key, value) in taken:
+                also = ', also of frames_topic' if value == frames_topic else ''
+                raise ValueError(f'neighbors[{i}].{key} = {value!r}: must be unique{also}')
+            taken.add((key, value))
     return NeighborConfig(dictionary, neighbors, frames_topic)
 
 
@@ -217,8 +247,11 @@ def _parse_neighbor(where: str, entry: Any, ids: Range | None) -> MarkedNeighbor
         'name', *_MARKER_KEYS}, {'role', 'radius', 'tag_position'} | (
             _SOURCE_KEYS if source else set()))
     name, role, radius = entry['name'], entry.get('role', 'leader'), entry.get('radius', 0.0)
-    if not isinstance(name, str) or name.split() != [name]:
-        raise ValueError(f'{where}.name = {name!r}: must be a word')
+    if (not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME
+            or name in _OWN_FRAMES):
+        raise ValueError(
+            f'{where}.name = {name!r}: must be a word of letters, digits and _, such as leader_1; '
+            f'not {", ".join(_OWN_FRAMES)}, nor with /duplicate in it')
     if role not in ROLES:
         raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
     RADII.check(f'{where}.radius', radius)
@@ -249,18 +282,19 @@ def _parse_source(where: str, key: str, entry: Mapping[str, Any]) -> PoseSource:
             deviations[name] = float(entry[name])
         elif key == 'tf_frame' and not (only and name == 'attitude_std'):
             raise ValueError(f'{where} lacks {name}: transforms have no covariance')
-    topic = _name(f'{where}.{key}', entry[key])
-    if not topic:
-        raise ValueError(f"{where}.{key} = '': must be a word")
-    place = ('', topic) if key == 'tf_frame' else (topic, '')
-    return PoseSource(*place, deviations.get('position_std'), deviations.get('attitude_std'), only)
+    topic, frame = ('', _frame(f'{where}.{key}', entry[key])) if key == 'tf_frame' else (
+        entry[key], '')
+    if not frame:
+        check_topic(f'{where}.{key}', topic)
+    return PoseSource(topic, frame, deviations.get('position_std'),
+                      deviations.get('attitude_std'), only)
 
 
-def _name(where: str, value: Any) -> str:
-    """Return the name of a topic or frame."""
-    if not isinstance(value, str) or (value and value.split() != [value]):
+def _frame(where: str, value: Any) -> str:
+    """Return the name of a frame; tf2 knows none with a slash before it."""
+    if not isinstance(value, str) or value.split() != [value] or not value.strip('/'):
         raise ValueError(f'{where} = {value!r}: must be a word')
-    return value
+    return value.lstrip('/')
 
 
 def _parse_marker(where: str, entry: Any, ids: Range) -> Marker:

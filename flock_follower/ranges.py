@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The values that a number may take, with the one check of them; the remedy for a wrong name."""
+"""Values that a number, or the name of a topic, may take, with their check; remedies for names."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ import difflib
 from functools import cache
 import math
 from numbers import Integral, Real
+import re
 from typing import Any, Final
 
 
@@ -80,6 +81,21 @@ A_MAX = Range(1.5, 20.0, 'm/s^2')
 #: Below it gusts and the velocity error of odometry are as large as the limit.
 V_MAX = Range(0.1, 5.0, 'm/s')
 ODOM_TIMEOUT = Range(0.1, 1.0, 's')
+
+
+#: Words of a name in ROS, relative.
+WORDS: Final = '[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*'
+
+
+def check_topic(name: str, value: Any) -> None:
+    """
+    Check the value of a parameter that is a topic: relative, absolute or private.
+
+    :raises ValueError: naming the parameter, its value and the form of a topic.
+    """
+    if not isinstance(value, str) or not re.fullmatch(f'(/|~/)?{WORDS}', value):
+        raise ValueError(f'{name} = {value!r}: must be the name of a topic: words of letters, '
+                         'digits and _, none begins with a digit, with / between them')
 
 
 def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meaning: str = '', *,

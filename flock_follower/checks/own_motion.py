@@ -85,7 +85,11 @@ EVENTS: Final = (
     ('odom jumped', 'odom jumps', WARNING,
      'turn off loop closure and relocalization, or take the frame without them'),
     ('odom changed its frames', 'odom frames', ERROR,
-     'is it published by two sources? Every change starts perception anew'))
+     'is it published by two sources? Every change starts perception anew'),
+    ('odom out of order', 'odom order', WARNING,
+     'of two sources in one topic take one; messages older than the one before are not used'),
+    ('odom gap', 'odom gaps', WARNING,
+     'see in the log of its source why it pauses: without odometry the follower brakes'))
 #: Error of the mounting, rad, from which on there is a warning.
 MOUNTING_WARNING = math.radians(4.0)
 #: Error of the mounting, rad, from which on there is an error.
@@ -104,7 +108,8 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     motion = seen.own
     if motion is None:
         return
-    count = motion.lost + len(motion.states)
+    count = motion.lost + len(motion.states) + sum(
+        motion.events[each] for each in ('odom out of order', 'odom stamp repeated'))
     if motion.lost:
         yield grade(motion.lost > LOST * count, True, 'odom',
                     f'{motion.lost} of {count} are invalid: {motion.last_error}',
@@ -114,7 +119,8 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
         return
     yield from _parameters_alike(seen)
     for event, what, level, advice in EVENTS:
-        if times := motion.events[event]:
+        of_recording = event == 'odom gap' and (seen.gaps or seen.busy)  # reported by itself
+        if (times := motion.events[event]) and not of_recording:
             yield Finding(level, what, f'{times} in {count} messages', 'none', advice)
     yield from _positions(motion.source.twist, float(np.median(
         [state.position[2] for state in motion.states])))

@@ -64,7 +64,7 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
     :param max_wait: the longest time for which a pose waits for odometry of its stamp, s.
     """
     perceiver = Perceiver(Tracker(config, Transform()), max_wait=max_wait)
-    perceiver.sources.frames.update(cameras)
+    perceiver.sources.frames.update({name.lstrip('/'): T for name, T in cameras.items()})
     perceiver.sources.static = static
     seen = {n.name: SourceSeen(n.source.topic) for n in config.neighbors if n.source is not None}
     frames = dict.fromkeys(seen, '')
@@ -83,7 +83,7 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
         frames[name] = pose.frame
         if (refused := perceiver.take_pose(name, pose, time)) is not None:
             its.refused[refused[0]] += 1
-        elif pose.frame in cameras:
+        elif pose.frame.lstrip('/') in perceiver.sources.frames:
             its.outside += bool(
                 pose.position[2] < MIN_COS_SIGHT * np.linalg.norm(pose.position))
         for outcome in perceiver.sources.due(time):

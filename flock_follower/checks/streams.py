@@ -78,8 +78,10 @@ def check_latency(seen: Observations, name: str, topic: TopicSeen,
                   latencies: tuple[float, float], sooner: str) -> Finding:
     """Check stamps and latency of a topic with messages, see ``check_stream``."""
     late = np.array(topic.arrivals) - np.array(topic.stamps)
-    middle, most = float(np.median(late)), float(np.percentile(late, 95))
     stamped = np.array(topic.stamps) > 0.0
+    unstamped = int(np.count_nonzero(~stamped)) if stamped.any() else 0  # of all, another clock
+    judged = late[stamped] if unstamped else late
+    middle, most = float(np.median(judged)), float(np.percentile(judged, 95))
     steps = np.diff(late[stamped])
     jumps = np.flatnonzero(np.abs(steps) > OTHER_CLOCK)
     jump, since = ((-steps[jumps[0]], np.array(topic.arrivals)[stamped][jumps[0]]
@@ -87,13 +89,21 @@ def check_latency(seen: Observations, name: str, topic: TopicSeen,
     ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
     synchronize = 'synchronize the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
     measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
-    repeated = int(np.count_nonzero(np.diff(np.array(topic.stamps)[stamped]) == 0.0))
+    after = np.diff(np.array(topic.stamps)[stamped])
+    no_stamp = (f'{unstamped} of {len(topic.stamps)} have no stamp',
+                'have the driver stamp each message when it is measured')
+    repeated, older = int(np.count_nonzero(after == 0.0)), int(np.count_nonzero(after < 0.0))
     return first(
         f'{name} latency', f'below {latencies[0]:g} s after its stamp',
         (jumps.size, ERROR,
          f'stamps jump by {jump:+.1f} s against the time they came, after {since:.1f} s',
          'a clock was set meanwhile: synchronize all clocks before the flight (chrony, PTP), and '
          'have the driver stamp by the clock of ROS'),
+        (unstamped > REPEATED * len(topic.stamps), ERROR, *no_stamp),
+        (older > REPEATED * len(topic.stamps), ERROR,
+         f'{older} of {len(topic.stamps)} are older than the message before',
+         'of two cameras, or two sources, in one topic take one; else the clock of the driver is '
+         'set back again and again'),
         (repeated > REPEATED * len(topic.stamps), ERROR,
          f'{repeated} of {len(topic.stamps)} have the stamp of the message before',
          'have the driver stamp each message when it is measured; of a camera that publishes each '
@@ -109,4 +119,5 @@ def check_latency(seen: Observations, name: str, topic: TopicSeen,
          BUSY + measured, ''),
         (middle > latencies[1], ERROR, measured, sooner),
         (middle > latencies[0] or most > latencies[1], WARNING, measured, sooner),
+        (unstamped, WARNING, *no_stamp),
         (True, OK, measured, ''))

@@ -206,7 +206,10 @@ class Observer(Node):
         if name in COUNTED or self.seen.names.get(name, topic) != topic:  # of another camera
             message = None
         elif isinstance(message, bytes):
-            message = read_odometry(message)
+            try:
+                message = read_odometry(message)
+            except ValueError:  # its arrival counts, without a stamp
+                message = None
         self._collector.take(name, topic, message, arrival)
 
     def _look_at_graph(self) -> None:

@@ -76,6 +76,8 @@ MAX_REPORTED = 50
 MAX_ATTITUDES = 100
 #: A velocity of this variance, (m/s)^2, is invalid: rtabmap sends zeros with 9999 without one.
 INVALID_VARIANCE = 1e3
+#: Correlations in a covariance, with the rounding of its numbers.
+MAX_CORRELATION: Final = 1.001
 _ORDERS: Final = {b'\x00\x00': '>', b'\x00\x01': '<'}
 _ALIGNMENT_START: Final[int] = 4  # bytes before the first that counts for alignment
 
@@ -312,15 +314,19 @@ class OdometrySource:
             return known  # it seldom changes
         matrix = numbers.reshape(6, 6).copy()
         # Enough for both parts, and as fast as a message needs it; NaN fails.
-        sane = numbers.dot(numbers) < SANE**2 and min(matrix.diagonal().tolist()) > 0.0
+        sane = numbers.dot(numbers) < SANE**2 and min(matrix.diagonal().tolist()) > 0.0 and (
+            _is_correlated(matrix))
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
             lacking = not (sane or (np.all(np.abs(matrix[part]) < SANE)  # refuses NaN, too
-                                    and np.all(matrix.diagonal()[part] > 0.0)))
+                                    and np.all(matrix.diagonal()[part] > 0.0)
+                                    and _is_correlated(matrix[part, part])))
             if lacking:
                 matrix[part] = matrix[:, part] = 0.0
                 matrix[part, part] = variance * np.eye(3)
             self._lacks(f'{name} covariance of the {field}', lacking, 'odom_std')
+        if not sane:
+            matrix[:3, 3:] = matrix[3:, :3] = 0.0
         self._covariances_before[field] = given, matrix
         return matrix
 
@@ -329,6 +335,12 @@ class OdometrySource:
             self.missing[quantity] = instead
         else:
             self.missing.pop(quantity, None)
+
+
+def _is_correlated(matrix: Array) -> bool:
+    """Return whether no correlation in a matrix (n, n) exceeds 1: else it is no covariance."""
+    variances = matrix.diagonal()
+    return bool((matrix * matrix <= MAX_CORRELATION**2 * variances[:, None] * variances).all())
 
 
 def read_odometry(data: bytes) -> Any:

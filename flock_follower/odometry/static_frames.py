@@ -16,7 +16,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from flock_follower.geometry import Transform
+from flock_follower.messages import SANE
 
 
 class StaticFrames:
@@ -26,7 +29,14 @@ class StaticFrames:
         self._parents: dict[str, tuple[str, Transform]] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Set the pose of a frame in its parent."""
+        """
+        Set the pose of a frame in its parent.
+
+        :raises ValueError: if its translation is not finite, or beyond ``SANE``.
+        """
+        if not np.all(np.abs(T_parent_child.translation) <= SANE):  # NaN fails
+            raise ValueError(f'{child} in {parent}: {T_parent_child.translation.tolist()}: must '
+                             f'be finite, and within {SANE:g} m')
         self._parents[child] = parent, T_parent_child
 
     def pose(self, frame: str, on: str) -> Transform | None:

@@ -23,15 +23,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+import math
 from typing import Any, Final, NamedTuple
 
 from flock_follower.parameters.spec import CAMERA_NAMES, NAMES, Spec
-from flock_follower.ranges import MAX_OFFSET, Range
+from flock_follower.ranges import check_topic, MAX_OFFSET, Range
 
 #: Default position of a camera on the body, m: in front of the middle of the vehicle.
 DEFAULT_POSITION: Final = (0.10, 0.0, 0.0)
 #: Default attitude of a camera on the body, rad: it looks ahead.
 DEFAULT_RPY: Final = (0.0, 0.0, 0.0)
+#: Each coordinate of a camera on the body.
+PLACES: Final = Range(-10.0, 10.0, 'm')
+#: Roll, pitch and yaw of a camera: more is in degrees.
+ANGLES: Final = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
 
 CAMERA_SPECS = [
     CAMERA_NAMES,
@@ -39,11 +44,11 @@ CAMERA_SPECS = [
          "topic of the camera's images; of compressed images without /compressed"),
     Spec('camera.NAME.camera_info', 'NAME/camera_info', "topic of the camera's calibration"),
     Spec('camera.NAME.position', list(DEFAULT_POSITION),
-         'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
+         'place of the camera on the body, FLU', PLACES, fixed_length=True),
     Spec('camera.NAME.rpy', list(DEFAULT_RPY),
          'roll, pitch, yaw of the camera on the body; zeros look ahead, [0, 0, 1.5708] to the '
          'left',
-         Range(unit='rad'), fixed_length=True),
+         ANGLES, fixed_length=True),
     Spec('camera.NAME.rectified', False, 'whether the images are undistorted already'),
     Spec('camera.NAME.time_offset', 0.0, 'time_offset of this camera',
          Range(-MAX_OFFSET, MAX_OFFSET, 's')),
@@ -80,8 +85,8 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     """
     Return the cameras in the checked values of a node's parameters.
 
-    :raises ValueError: if two cameras share a name or a topic, or if a parameter of a single
-        camera is set beside several cameras.
+    :raises ValueError: if a topic is none, if two cameras share a name or a topic, or if a
+        parameter of a single camera is set beside several cameras.
     """
     names = [name for name in values[NAMES] if name]
     if not names:
@@ -93,6 +98,9 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
                              f'{names}: set camera.{names[0]}.{key}, and so on')
     found = [CameraValues(name, **{key: values[f'camera.{name}.{key}']
                                    for key in CameraValues._fields[1:]}) for name in names]
+    for camera in found:
+        for key in ('image', 'camera_info'):
+            check_topic(f'camera.{camera.name}.{key}', getattr(camera, key))
     for other, camera in combinations(found, 2):
         same = [key for key in ('image', 'camera_info')
                 if getattr(camera, key) == getattr(other, key)]

@@ -54,6 +54,9 @@ FOCAL_LENGTH_RANGE = (0.02, 1000.0)
 #: Largest distance of the optical axis from the middle, as a share of the image size: K for
 #: images of twice or half the size is off by 0.5 and 0.25.
 MAX_AXIS_OFFSET = 0.15
+#: Place of the optical axis as a share of the image size, beyond what the smallest region of a
+#: sensor has: outside, K is noise.
+AXIS_RANGE = Range(-100.0, 101.0)
 _SIZE = Range(1, 65535, 'px', whole=True)
 #: Beyond this radius in normalized coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
@@ -98,6 +101,8 @@ class CameraModel:
         low, high = (share * max(width, height) for share in FOCAL_LENGTH_RANGE)
         for focal in self.matrix.diagonal()[:2].tolist():
             Range(low, high, 'px').check(f'K: focal length for {width}x{height}', focal)
+        for share in (self.matrix[:2, 2] / (width, height)).tolist():
+            AXIS_RANGE.check(f'K: optical axis as a share of {width}x{height}', share)
         self._transposed, self._middle = self.matrix[:2, :2].T, self.matrix[:2, 2]
         fisheye = self.model == 'equidistant'
         p1, p2 = self._tangential = (0.0, 0.0) if fisheye else self.distortion[2:4].tolist()
@@ -129,8 +134,9 @@ class CameraModel:
         if not rectified:
             return cls(_reshaped('K', K, (3, 3)), np.asarray(D, float), distortion_model,
                        width, height)
-        if P is None:
-            raise ValueError('P = None: a rectified image needs the projection matrix P')
+        if P is None or not np.any(P):
+            raise ValueError(f'P = {None if P is None else 0}: a rectified image needs the '
+                             'projection matrix P')
         return cls(_reshaped('P', P, (3, 4))[:, :3], np.zeros(5), 'plumb_bob', width, height)
 
     @classmethod
@@ -368,9 +374,11 @@ def _checked_matrix(matrix: Array) -> Array:
         raise ValueError(f'K = {matrix.tolist()}: must be 3 x 3 finite numbers')
     if not matrix.any():
         raise ValueError('K = 0: the camera is not calibrated (camera_info carries no matrix)')
-    if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0 and np.array_equal(matrix[2], [0, 0, 1])):
-        raise ValueError(f'K = {matrix.tolist()}: must have positive focal lengths and the last '
-                         'row 0 0 1')
+    (focal, skew, _), (below, other, _), last = matrix.tolist()
+    if not (focal > 0.0 and other > 0.0 and abs(skew) <= focal and below == 0.0
+            and last == [0.0, 0.0, 1.0]):
+        raise ValueError(f'K = {matrix.tolist()}: must have positive focal lengths, a skew of at '
+                         'most the first, 0 below it, and the last row 0 0 1')
     return matrix
 
 

@@ -23,7 +23,14 @@ from typing import Any
 from flock_follower.files import resource
 from flock_follower.geometry import Transform
 from flock_follower.odometry.reader import SourceParams
-from flock_follower.parameters.cameras import CAMERA_SPECS, cameras, DEFAULT_POSITION, DEFAULT_RPY
+from flock_follower.parameters.cameras import (
+    ANGLES,
+    CAMERA_SPECS,
+    cameras,
+    DEFAULT_POSITION,
+    DEFAULT_RPY,
+    PLACES,
+)
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.perception.markers import load
 from flock_follower.perception.neighbor_filter import FilterParams
@@ -42,10 +49,10 @@ RELATIVE_POSE = [
          'YAML file of the neighbors and their markers; empty: config/neighbors.yaml of this '
          'package'),
     Spec('camera_position', list(DEFAULT_POSITION),
-         'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
+         'place of the camera on the body, FLU', PLACES, fixed_length=True),
     Spec('camera_rpy', list(DEFAULT_RPY),
          'roll, pitch, yaw of the camera on the body; zeros look ahead',
-         Range(unit='rad'), fixed_length=True),
+         ANGLES, fixed_length=True),
     Spec('image_transport', 'raw',
          'subscribe image_raw or image_raw/compressed', ('raw', 'compressed')),
     Spec('rectified', False, 'the images are undistorted already: use P of camera_info'),

@@ -137,9 +137,11 @@ class Perceiver:
                        roi.x_offset, roi.y_offset, roi.width, roi.height,
                        message.binning_x, message.binning_y)
         known = self._cameras[camera]
-        known.frame = message.header.frame_id
-        if known.frame:
-            self.sources.frames[known.frame] = self.tracker.cameras[camera].T_body_camera
+        if known.frame != message.header.frame_id:
+            known.frame = message.header.frame_id
+            self.sources.place_cameras(
+                (each.frame.lstrip('/'), self.tracker.cameras[name].T_body_camera)
+                for name, each in self._cameras.items())
         if calibration == known.calibration:
             return False
         known.model, known.calibration = None, ()

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import math
 from typing import NamedTuple
 
@@ -50,6 +50,8 @@ OLDEST_POSE = 1.0
 #: s: a pose and a frame whose stamps differ by less are of one image.
 SAME_IMAGE = 1e-3
 MOST_WAITING = 100  # poses, and frames: a bound on memory
+#: m: a body that is nearer to the own frame is none: some detectors send zeros if they find none.
+NEAREST = 0.05
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
 AXES_VARIANCE = 1e-4
 BASE = 'base_link'
@@ -58,7 +60,7 @@ MANY_OUTLIERS = 0.02  # share of poses outside the gate that is reported
 
 UNKNOWN_FRAME = 'pose in an unknown frame'
 UNTIMELY = 'pose stamp repeated, too old or ahead of the odometry'
-INVALID = 'pose not finite, or too far away'
+INVALID = 'pose not finite, at the own place or too far away'
 NO_ATTITUDE = 'pose with a zero quaternion'
 NO_COVARIANCE = 'pose without a covariance'
 INVALID_COVARIANCE = 'pose with an invalid covariance'
@@ -115,6 +117,12 @@ class PoseSources:
         self._wait = ObservedWait(max_wait, 1.0, needed=1)  # of frames for their poses
         self.restart()
 
+    def place_cameras(self, placed: Iterable[tuple[str, Transform]]) -> None:
+        """Take frame and pose on the body of each camera; a frame of two cameras is of neither."""
+        placed = [each for each in placed if each[0]]
+        names = [name for name, _ in placed]
+        self.frames = {name: pose for name, pose in placed if names.count(name) == 1}
+
     def restart(self) -> None:
         """Forget all that waits."""
         self._newest = dict.fromkeys(self.sources, -math.inf)
@@ -137,18 +145,22 @@ class PoseSources:
         :param odom_frame: the frame of the odometry; '' if it is unknown.
         """
         source, newest = self.sources[name], self._tracker.newest_odometry
-        if newest is None or not odom_frame:
+        if newest is None:
             return UNPLACED, name
         if not max(newest - OLDEST_POSE, self._newest[name]) < stamp <= newest + AHEAD_OF_ODOMETRY:
             return UNTIMELY, f'{name}: {stamp - newest:.2f} s after the odometry'
         frame = state.frame.lstrip('/')
-        T_body_frame = self._mounting(frame)
-        if T_body_frame is None and frame != odom_frame.lstrip('/'):
+        odom, T_body_frame = odom_frame.lstrip('/'), self._mounting(frame)
+        if frame in self.frames and frame in (BASE, odom):
+            return UNKNOWN_FRAME, (f'{name}: frame {frame!r} is also that of a camera, whose axes '
+                                   'are others: camera_info must have a frame of its own')
+        if T_body_frame is None and (not frame or frame != odom):
+            expected = odom_frame or 'that of the odometry'
             return UNKNOWN_FRAME, (
-                f'{name}: frame {frame!r}: must be {odom_frame}, {BASE}, a frame connected to it '
-                f'by tf_static, or of a camera: {", ".join(self.frames) or "no camera_info yet"}')
-        if not math.hypot(*state.position.tolist()) <= (
-                SANE if T_body_frame is None else FARTHEST):  # NaN fails
+                f'{name}: frame {frame!r}: must be {expected}, {BASE}, a frame connected to it by '
+                f'tf_static, or of a camera: {", ".join(self.frames) or "no camera_info yet"}')
+        nearest, farthest = (0.0, SANE) if T_body_frame is None else (NEAREST, FARTHEST)
+        if not nearest <= math.hypot(*state.position.tolist()) <= farthest:  # NaN fails
             return INVALID, f'{name}: position {state.position.tolist()}'
         checked = _attitude(source, state)
         if isinstance(checked, str):

@@ -37,6 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
+from flock_follower.messages import FARTHEST
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
@@ -137,8 +138,11 @@ class Ranging:
         if series is None:
             return UNKNOWN, f'frame_id {measured.name!r}: must be one of {", ".join(self._series)}'
         low, high = measured.limits if measured.limits[0] < measured.limits[1] else (0.0, math.inf)
-        if not (low <= measured.distance <= high and 0.0 <= measured.distance < math.inf):
-            return INVALID, f'{measured.name}, {measured.distance:.3g} m: [{low:g}, {high:g}] m'
+        high = min(high, FARTHEST)
+        # Radios send 0 for none; NaN fails.
+        if not (low <= measured.distance <= high and measured.distance > 0.0):
+            return INVALID, (f'{measured.name}, {measured.distance:.3g} m: must be in '
+                             f'[{low:g}, {high:g}] m, and not 0')
         if newest is None:
             return UNPLACED, measured.name
         if not max(newest - OLDEST_RANGE, series.newest) < stamp <= newest + AHEAD_OF_ODOMETRY:

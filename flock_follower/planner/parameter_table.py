@@ -23,10 +23,9 @@ from typing import Any
 
 from flock_follower.neighbors_file import load
 from flock_follower.odometry.reader import SourceParams
-from flock_follower.parameters.cameras import CAMERA_SPECS, cameras, DEFAULT_RPY
+from flock_follower.parameters.cameras import ANGLES, CAMERA_SPECS, cameras, DEFAULT_RPY
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.planner.params import Member, PlannerParams
-from flock_follower.ranges import Range
 from flock_follower.settings import refuse
 
 PLANNER = [
@@ -39,7 +38,7 @@ PLANNER = [
          'every vehicle seen is a leader of radius 0'),
     Spec('camera_rpy', list(DEFAULT_RPY),
          'roll, pitch, yaw of the camera on the body, the same as for relative_pose',
-         Range(unit='rad'), fixed_length=True),
+         ANGLES, fixed_length=True),
     Spec('rectified', False,
          'the images are undistorted already, the same as for relative_pose'),
     *CAMERA_SPECS,

@@ -91,7 +91,9 @@ class Access:
 
     def matches(self, offered: str) -> bool:
         """Return whether an offered token is the right one; in constant time."""
-        return bool(self.token) and hmac.compare_digest(offered.encode(), self.token.encode())
+        # Bytes that are no UTF-8 come as surrogates, which encode() alone refuses.
+        return bool(self.token) and hmac.compare_digest(
+            offered.encode(errors='surrogatepass'), self.token.encode())
 
     def refuse_host(self, header: str) -> str:
         """Return ``HOST`` if the Host header of a request names no address of ours; or ''."""

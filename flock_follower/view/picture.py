@@ -58,7 +58,7 @@ def draw_picture(image: GrayImage, camera: CameraModel | None, T_odom_camera: Tr
     if camera is not None:
         camera.check_image(width, height)
     if scale < 1.0:
-        image = np.asarray(cv2.resize(image, (WIDTH, round(height * scale)),
+        image = np.asarray(cv2.resize(image, (WIDTH, max(round(height * scale), 1)),
                                       interpolation=cv2.INTER_AREA), np.uint8)
     canvas: Canvas = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
     if camera is not None and T_odom_camera is not None:

@@ -148,6 +148,13 @@ def stamped(name: str, seconds: float) -> Change:
         stamps=[stamp + seconds for stamp in seen.topic(name).stamps])
 
 
+def unstamped(each: int) -> Change:
+    """Return a change of the stamp of each third, fourth, ... image to 0."""
+    return lambda seen: vars(seen.topic('image_raw')).update(stamps=[
+        0.0 if n % each == 0 else stamp
+        for n, stamp in enumerate(seen.topic('image_raw').stamps)])
+
+
 def stamped_as(index: Callable[[int], int]) -> Change:
     """Return a change of the stamps of images to those of other images, by their numbers."""
     def make(seen: Observed) -> None:
@@ -407,6 +414,16 @@ FAULTS: list[Fault] = [
               for row in seen.rows for y in (3, 6, 10, 13)]),
     Fault('loop closures', BOTH, WARNING, 'odom jumps', '1 in 250', 'turn off loop closure',
           lambda seen: [row.__setitem__(2, row[2] + 1.0) for row in seen.rows[125:]]),
+    Fault('odometry that pauses', BOTH, WARNING, 'odom gaps', '1 in 215', 'why it pauses',
+          lambda seen: seen.rows.__delitem__(slice(100, 135))),
+    Fault('odometry of two sources', BOTH, WARNING, 'odom order', '1 in 250', 'two sources',
+          lambda seen: seen.rows.insert(125, seen.rows.pop(120))),
+    Fault('images of which some have no stamp', BOTH, ERROR, 'images latency', 'have no stamp',
+          'stamp each message', unstamped(3)),
+    Fault('images of which few have no stamp', BOTH, WARNING, 'images latency', 'have no stamp',
+          'stamp each message', unstamped(30)),
+    Fault('images of two clocks', BOTH, ERROR, 'images latency', 'older than the message before',
+          'take one', stamped_as(lambda n: n - 12 * (n > 12 and n % 2))),
     Fault('images that stop', LIVE, ERROR, 'images', 'stopped: none in the last 3', 'is it still',
           kept('image_raw', slice(60))),
     Fault('images above the shared memory', LIVE, WARNING, 'shared memory',

@@ -18,10 +18,11 @@ from __future__ import annotations
 
 from pathlib import Path
 import time
+from types import SimpleNamespace
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
@@ -40,6 +41,18 @@ def test_no_arrival_is_counted_before_the_clock_is_known(ros: None, monkeypatch:
         observer._take('odom', '/odom', serialize_message(Odometry()),
                        {'received_timestamp': time.time_ns()})
     assert observer.seen.topics['/odom'].arrivals == [100.0, 101.0]
+    observer.destroy_node()
+
+
+def test_invalid_messages_do_not_end_the_observation(ros: None, monkeypatch: Any) -> None:
+    observer, now = Observer(1.0, '', {}, ''), time.monotonic()
+    monkeypatch.setattr(time, 'monotonic', lambda: now + DISCOVERY + 0.1)
+    observer._take('odom', '/odom', b'no message', {'received_timestamp': 1_000_000_000})
+    assert observer.seen.topics['/odom'].stamps == [0.0]
+    wrong = TransformStamped(child_frame_id='imu')
+    wrong.header.frame_id, wrong.transform.rotation.w = 'base_link', 0.0
+    observer._static._take_valid(SimpleNamespace(transforms=[wrong]))
+    assert observer._static.transform('imu') is None
     observer.destroy_node()
 
 

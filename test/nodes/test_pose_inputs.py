@@ -175,10 +175,24 @@ def test_a_pose_without_covariance_needs_deviations(
         assert r.counters[NO_COVARIANCE] == 1 - number
 
 
+@pytest.mark.parametrize('text', [
+    FILE.replace('frames_topic: camera_info', 'frames_topic: /poses'),
+    'neighbors: [{name: leader, pose_topic: poses}, {name: other, pose_topic: /poses}]'])
+def test_topic_with_two_uses_is_refused(rig: Callable[..., Rig], text: str) -> None:
+    with pytest.raises(ValueError, match='/poses is the topic of two neighbors'):
+        rig(text)
+
+
 def test_a_topic_of_another_type_is_reported(
         rig: Callable[..., Rig], ends: dict[str, list[str]]) -> None:
     ends['/poses'] = ['std_msgs/msg/String']
     assert 'holds std_msgs/msg/String' in rig().problems()
+
+
+def test_topic_of_frames_without_a_header_is_reported(
+        rig: Callable[..., Rig], ends: dict[str, list[str]]) -> None:
+    ends['/camera_info'] = ['std_msgs/msg/String']
+    assert 'frames_topic /camera_info holds std_msgs/msg/String' in rig().problems()
 
 
 def test_a_transform_needs_tf2_msgs(rig: Callable[..., Rig]) -> None:

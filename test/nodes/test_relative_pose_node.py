@@ -319,14 +319,14 @@ def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..
     r.range(0.0, 2.0)
     for k in range(6):
         r.odom(k / 5)
-    for distance, name in ((2.0, 'nobody'), (float('nan'), 'leader'), (2.0, 'leader'),
-                           (2.0, 'leader')):
+    for distance, name in ((2.0, 'nobody'), (float('nan'), 'leader'), (0.0, 'leader'),
+                           (1e9, 'leader'), (2.0, 'leader'), (2.0, 'leader')):
         r.range(1.0, distance, name)
     r.range(1.0, 0.1, min_range=0.3, max_range=50.0)
     r.odom(1.1, velocity=np.full(3, np.nan))
     assert r.counters == {
         'range without odometry': 1, 'range of an unknown neighbor': 1,
-        'range outside its limits': 2, 'invalid odom': 1,
+        'range outside its limits': 4, 'invalid odom': 1,
         'range stamp repeated, too old or ahead of the odometry': 1}
     assert not r.found
 
@@ -339,7 +339,10 @@ def test_the_child_frame_of_odom_is_placed_by_tf_static(
     imu.header.frame_id = 'base_link'
     set_vector(imu.transform.translation, T_base_imu.translation)
     set_quaternion(imu.transform.rotation, T_base_imu.quaternion)
-    r.node._own._static.take(SimpleNamespace(transforms=[imu]))
+    wrong = TransformStamped(child_frame_id='lidar')  # it does not cost the other
+    wrong.transform.rotation.w = 0.0
+    with pytest.raises(ValueError, match='quaternion'):
+        r.node._own._static.take(SimpleNamespace(transforms=[wrong, imu]))
     T_odom_imu = OWN @ T_base_imu
     r.give('odom', to_odometry(nanoseconds_to_stamp(START), 'odom', 'imu', T_odom_imu.translation,
                                T_odom_imu.quaternion, np.zeros(3)))

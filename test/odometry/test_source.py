@@ -235,6 +235,22 @@ def test_velocity_with_absurd_variance_is_not_used() -> None:
     assert 'velocity' in source.missing
 
 
+@pytest.mark.parametrize(('row', 'column', 'value', 'lacking'), [
+    (0, 1, -50.0, 'linear'), (4, 3, 50.0, 'angular'), (0, 1, 0.99e-2, ''), (1, 4, 50.0, '')])
+def test_correlation_above_1_is_no_covariance(
+        row: int, column: int, value: float, lacking: str) -> None:
+    source, sent = OdometrySource(SourceParams(std=(0.2, 0.1, 0.3, 0.4))), message(0.0)
+    covariance = 0.01 * np.eye(6)
+    covariance[row, column] = covariance[column, row] = value
+    sent.pose.covariance = covariance.reshape(36)
+    used = taken(source, sent, 0.0).pose_covariance
+    assert np.linalg.eigvalsh(used)[0] > 0.0
+    assert [part for part in ('linear', 'angular')
+            if f'{part} covariance of the pose' in source.missing] == [lacking] * bool(lacking)
+    np.testing.assert_allclose(np.sqrt(used.diagonal()), [
+        0.2 if lacking == 'linear' else 0.1] * 3 + [0.1] * 3)
+
+
 def test_another_frame_begins_anew() -> None:
     source = OdometrySource()
     read(source, Source(), 3.0)

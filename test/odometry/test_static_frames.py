@@ -17,7 +17,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 
 from flock_follower.geometry import quaternion_from_rpy, Transform
 from flock_follower.odometry.static_frames import StaticFrames
@@ -42,6 +45,14 @@ def test_a_frame_is_found_up_down_and_across_the_tree() -> None:
         pose = tree().pose(frame, on)
         assert pose is not None
         np.testing.assert_allclose(pose.apply(point), expected.apply(point), atol=1e-12)
+
+
+@pytest.mark.parametrize('translation', [[math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [1e9] * 3])
+def test_place_that_is_no_number_of_meters_is_refused(translation: list[float]) -> None:
+    frames = tree()
+    with pytest.raises(ValueError, match='imu in camera'):
+        frames.add('camera', 'imu', Transform(np.eye(3), np.array(translation)))
+    assert frames.pose('imu', 'base_link') is not None  # that of before
 
 
 def test_unconnected_frames_are_not_guessed_circle_ends() -> None:

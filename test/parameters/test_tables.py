@@ -70,6 +70,22 @@ def test_several_have_parameters_of_their_own_in_both_nodes() -> None:
         [0.5403, 0.8415, 0.0], abs=1e-4)
 
 
+@pytest.mark.parametrize(('given', 'message'), [
+    ({'camera_rpy': [0.0, 0.0, 90.0]}, r'camera_rpy = .* in \[-6\.28319, 6\.28319\] rad'),
+    (two(rpy=[0.0, 0.0, 90.0]), r'camera\.left\.rpy = .* in \[-6\.28319, 6\.28319\] rad'),
+    (two(position=[100.0, 0.0, 0.0]), r'camera\.left\.position = .* in \[-10, 10\] m')])
+def test_degrees_and_millimeters_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        values(**given)
+
+
+@pytest.mark.parametrize('key', ['image', 'camera_info'])
+@pytest.mark.parametrize('topic', ['', '/', 'left-1/image', '1st', 'a//b', 'a b', 'a/'])
+def test_name_that_is_no_topic_is_refused(key: str, topic: str) -> None:
+    with pytest.raises(ValueError, match=rf"camera\.left\.{key} = '{topic}': must be the name"):
+        cameras(values(**two(**{key: topic}))['relative_pose'])
+
+
 def test_the_example_is_taken_and_holds_all_that_a_camera_has() -> None:
     reported = read_parameters(resource('config/two_cameras.yaml'), TABLE)
     for node, build in BUILT.items():

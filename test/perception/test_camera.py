@@ -146,7 +146,11 @@ def test_region_of_interest_and_binning_see_the_same_rays() -> None:
     ({'width': 0}, 'width = 0'),
     ({'height': -3}, 'height = -3'),
     ({'rectified': True}, 'P = None'),
-    ({'rectified': True, 'P': np.zeros(12)}, 'not calibrated')])
+    ({'rectified': True, 'P': np.zeros(12)}, 'P = 0'),
+    ({'K': np.array([600.0, 0.0, 1e6, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0])},
+     r'optical axis as a share of 640x480 = 1562\.5'),
+    ({'K': np.array([600.0, 600.0, 320.0, 600.0, 600.0, 240.0, 0.0, 0.0, 1.0])}, '0 below it'),
+    ({'K': np.array([600.0, 1e4, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0])}, 'a skew of at')])
 def test_bad_calibrations_are_refused_by_name(change: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {
         'K': K, 'D': [0.0] * 5, 'distortion_model': 'plumb_bob', 'width': 640, 'height': 480}

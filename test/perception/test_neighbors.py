@@ -105,6 +105,12 @@ def two(**changes: Any) -> dict[str, Any]:
     (two(marker_id=0), r'neighbors\[1\]\.marker_id = 0: must be unique'),
     (document(name='the leader'), r"neighbors\[0\]\.name = 'the leader': must be a word"),
     (document(name=7), 'name = 7'),
+    # The name is a part of topics, and a frame.
+    *((document(name=name), f"name = '{name}': must be a word of letters")
+      for name in ('leader-1', '1st', 'führer', 'a//b', '/a', 'a/', 'a' * 101, 'base_link',
+                   'leader/duplicate', 'leader/duplicate_2')),
+    ({'neighbors': None}, 'the document lacks dictionary'),
+    ({'neighbors': 5}, 'the document lacks dictionary'),
     (document(marker_id=True), 'marker_id = True'),
     (document(side_length=0.0), r'side_length = 0\.0: must be a number in \[0\.01, 2\] m'),
     (document(side_length=float('nan')), 'side_length = nan'),
@@ -125,9 +131,20 @@ def test_wrong_files_are_refused_by_place_and_value(broken: Any, message: str) -
 
 @pytest.mark.parametrize(('text', 'message'), [
     ('neighbors: []\n', r'wrong\.yaml: the document lacks dictionary'),
-    ('neighbors: [\n', r'wrong\.yaml: not valid YAML')])
+    ('neighbors: [\n', r'wrong\.yaml: not valid YAML'),
+    ('dictionary: A\nneighbors:\n  - {name: a, marker_id: 1, "marker_id": 2}\n',
+     r'wrong\.yaml: line 3: marker_id is given twice')])
 def test_errors_name_the_file(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / 'wrong.yaml'
     path.write_text(text, encoding='utf-8')
     with pytest.raises(ValueError, match=message):
         load(path)
+
+
+def test_keys_that_are_merged_in_may_be_given_anew(tmp_path: Path) -> None:
+    path = tmp_path / 'neighbors.yaml'
+    path.write_text('dictionary: DICT_4X4_50\nneighbors:\n  - &a {name: a, marker_id: 0, '
+                    'side_length: 0.1, position: [0, 0, 0], rpy: [0, 0, 0]}\n'
+                    '  - {<<: *a, name: b, marker_id: 1}\n', encoding='utf-8')
+    assert [(n.name, n.markers[0].marker_id) for n in load(path).neighbors] == [
+        ('a', 0), ('b', 1)]

@@ -30,6 +30,7 @@ from flock_follower.neighbors_file import NeighborConfig, parse, PoseSource
 from flock_follower.perception import pose_sources
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import Sourced
+from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseState
 
@@ -133,6 +134,9 @@ def test_position_only_has_certain_velocity_unknown_attitude() -> None:
     ({'stamp': 5}, pose_sources.UNTIMELY),
     ({'position': np.array([math.nan, 0.0, 1.0])}, pose_sources.INVALID),
     ({'position': np.array([0.0, 0.0, 1e3])}, pose_sources.INVALID),
+    # What a detector sends that found nothing.
+    ({'position': np.zeros(3), 'quaternion': np.array([0.0, 0.0, 0.0, 1.0])},
+     pose_sources.INVALID),
     ({'quaternion': np.array([0.0, 0.0, 0.0, math.nan])}, pose_sources.INVALID),
     ({'quaternion': np.zeros(4)}, pose_sources.NO_ATTITUDE),
     ({'covariance': np.zeros((6, 6))}, pose_sources.NO_COVARIANCE),
@@ -210,6 +214,9 @@ def test_frame_after_its_pose_teaches_later_ones_not_to_wait() -> None:
     ({'tf_frame': 'x'}, 'neighbors[0] lacks position_std'),
     ({'tf_frame': 'x', 'position_std': 0.1}, 'neighbors[0] lacks attitude_std'),
     ({'pose_topic': 'a b'}, 'neighbors[0].pose_topic'),
+    *(({'pose_topic': name}, 'neighbors[0].pose_topic') for name in ('', '/a//b', 'a-b', '/1')),
+    *(({'tf_frame': name, 'position_std': 0.1, 'attitude_std': 0.1}, 'neighbors[0].tf_frame')
+      for name in ('', '/', 5)),
     ({'pose_topic': '/x', 'marker_id': 1}, 'neighbors[0] has an unknown key marker_id'),
     ({'pose_topic': '/x', 'position_std': 0.0}, 'neighbors[0].position_std'),
     ({'pose_topic': '/x', 'position_only': 1}, 'neighbors[0].position_only')])
@@ -217,6 +224,51 @@ def test_a_wrong_source_is_refused(entry: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError) as caught:
         parse({'neighbors': [{'name': 'leader', **entry}]})
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize('key', ['pose_topic', 'tf_frame'])
+def test_one_source_is_of_one_neighbor(key: str) -> None:
+    leader, other = ({'name': name, key: 'x', 'position_std': 0.1, 'attitude_std': 0.1}
+                     for name in ('leader', 'other'))
+    with pytest.raises(ValueError, match=rf"neighbors\[1\]\.{key} = 'x': must be unique"):
+        parse({'neighbors': [leader, other]})
+
+
+def test_topic_of_the_poses_is_not_that_of_the_frames() -> None:
+    with pytest.raises(ValueError, match=r'neighbors\[0\]\.pose_topic = .*frames_topic'):
+        parse({'frames_topic': 'x', 'neighbors': [{'name': 'leader', 'pose_topic': 'x'}]})
+
+
+@pytest.mark.parametrize(('frames', 'known'), [
+    (('left', '/right'), True), (('right', 'right'), False), (('left', 'base_link'), False),
+    (('odom', 'right'), False)])
+def test_frame_with_two_meanings_is_not_guessed(frames: tuple[str, str], known: bool) -> None:
+    """A detector copies the frame of its images: two cameras may share one, or name the body's."""
+    turned = Transform(MOUNTING.rotation @ np.diag([-1.0, 1.0, -1.0]), MOUNTING.translation)
+    perceiver = Perceiver(Tracker(config(), {
+        'left': MountedCamera(turned), 'right': MountedCamera(MOUNTING)}), max_wait=0.35)
+    for name, frame in zip(('left', 'right'), frames):
+        calibration = empty('sensor_msgs/msg/CameraInfo')
+        calibration.header.frame_id = frame
+        with pytest.raises(ValueError, match='not calibrated'):
+            perceiver.take_camera_info(calibration, name)
+    seconds(perceiver, 0.0, 1.0)
+    named = frames[0] if frames[0] == 'odom' else frames[1]
+    refused = perceiver.take_pose('leader', pose(0.5)._replace(frame=named), 0.0)
+    assert (refused is None) == known
+    assert known or (refused and refused[0] == pose_sources.UNKNOWN_FRAME)
+
+
+def test_poses_of_the_body_need_no_frame_of_odometry() -> None:
+    perceiver = started()
+    for k in range(101):
+        nameless = pose(k * 0.01, 'odom')
+        perceiver.take_odometry(from_odometry(odometry(
+            empty, nameless.stamp, '', '', own_pose(k * 0.01).translation,
+            own_pose(k * 0.01).quaternion, np.zeros(3))))
+    assert perceiver.take_pose('leader', pose(0.5), 0.0) is None
+    refused = perceiver.take_pose('leader', pose(0.6)._replace(frame=''), 0.0)
+    assert refused is not None and refused[0] == pose_sources.UNKNOWN_FRAME
 
 
 def test_source_needs_no_dictionary_marker_beside_it_does() -> None:

@@ -74,7 +74,7 @@ def test_a_socket_of_another_origin_is_refused(origin: str, refused: str) -> Non
 
 @pytest.mark.parametrize(('access', 'offered', 'refused'), [
     (LOCAL, '', OFF), (REMOTE, 'secret', OFF), (CONTROL, '', TOKEN), (CONTROL, 'wrong', TOKEN),
-    (CONTROL, 'secret', '')])
+    (CONTROL, 'secret', ''), (CONTROL, '\udcff\udcfe', TOKEN)])  # of a cookie that is no text
 def test_buttons_act_with_control_and_token(
         access: Access, offered: str, refused: str) -> None:
     assert access.refuse_button(offered) == refused

@@ -69,6 +69,11 @@ def test_text_from_the_wire_is_drawn_inside_the_image() -> None:
         assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0).max() > 170  # brighter than GRAY
 
 
+def test_a_line_of_pixels_keeps_one() -> None:
+    jpeg = draw_picture(np.full((1, 4000), 100, np.uint8), None, None, [])
+    assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0).shape == (1, WIDTH)
+
+
 def test_image_of_other_size_than_calibration_is_refused() -> None:
     with pytest.raises(ValueError, match='camera_info is for 640x480'):
         draw_picture(np.zeros((10, 20), np.uint8), CAMERA, HERE, [])

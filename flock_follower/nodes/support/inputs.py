@@ -16,8 +16,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from typing import Any, Protocol
 
 from nav_msgs.msg import Odometry
@@ -45,6 +45,22 @@ def best_effort(depth: int = 1) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
+def for_each(messages: Iterable[Any], take: Callable[[Any], None]) -> None:
+    """
+    Take each of several messages.
+
+    :raises ValueError: the first that ``take`` raised; all others are taken.
+    """
+    invalid: ValueError | None = None
+    for message in messages:
+        try:
+            take(message)
+        except ValueError as error:
+            invalid = invalid or error
+    if invalid is not None:
+        raise invalid
+
+
 class NodeClock(Protocol):
     """A clock of a node that goes on evenly if the system clock is set: ``EvenClock``."""
 
@@ -66,18 +82,31 @@ class StaticChild:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
             return
-        subscribe = (partial(node.subscribe, required=False, largest=TRANSFORMS_BYTES_MAX)
-                     if isinstance(node, FlockNode) else node.create_subscription)
-        subscribe(TFMessage, '/tf_static', self.take, QoSProfile(
-            depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        if isinstance(node, FlockNode):
+            node.subscribe(TFMessage, '/tf_static', self.take, qos, required=False,
+                           largest=TRANSFORMS_BYTES_MAX)
+        else:
+            node.create_subscription(TFMessage, '/tf_static', self._take_valid, qos)
 
     def take(self, message: Any) -> None:
-        """Take a TFMessage."""
-        for stamped in message.transforms:
-            turn = stamped.transform.rotation
-            self.frames.add(
-                stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
-                    to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
+        """
+        Take a TFMessage.
+
+        :raises ValueError: if a transform is invalid; the others are taken.
+        """
+        for_each(message.transforms, self._add)
+
+    def _take_valid(self, message: Any) -> None:
+        """Take the valid transforms of a TFMessage: for a node that no callback may end."""
+        with suppress(ValueError):
+            self.take(message)
+
+    def _add(self, stamped: Any) -> None:
+        turn = stamped.transform.rotation
+        self.frames.add(
+            stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
+                to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
 
     def transform(self, child: str) -> Transform | None:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""

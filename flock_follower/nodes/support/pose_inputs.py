@@ -27,8 +27,13 @@ from rclpy.qos import QoSProfile
 
 from flock_follower.messages import stamp_age
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.diagnostics import Problem, STEADY, WARN
-from flock_follower.nodes.support.inputs import best_effort, StaticChild, TRANSFORMS_BYTES_MAX
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
+from flock_follower.nodes.support.inputs import (
+    best_effort,
+    for_each,
+    StaticChild,
+    TRANSFORMS_BYTES_MAX,
+)
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.pending_images import Perceiver
@@ -50,7 +55,8 @@ class PoseInputs:
     Subscribes each topic once its type is known, and passes on what arrives.
 
     :param process: is called after each message.
-    :raises ValueError: if a transform is wanted and tf2_msgs is not installed.
+    :raises ValueError: if a transform is wanted and tf2_msgs is not installed, or a topic is to
+        have two uses.
     """
 
     def __init__(self, node: FlockNode, perceiver: Perceiver, process: Callable[[], None],
@@ -68,8 +74,14 @@ class PoseInputs:
         self._contested: set[str] = set()
         """Topics with several publishers: their poses are refused."""
         self._subscribed: set[str] = set()
+        self._frames_fault = ''
+        """Why the topic of the frames cannot be used, or ''."""
         frames = perceiver.tracker.config.frames_topic
         self._frames = node.resolve_topic_name(frames) if frames else ''
+        topics = [node.resolve_topic_name(s.topic) for s in sources.values() if s.topic]
+        if twice := sorted(t for t in topics if topics.count(t) > 1 or t == self._frames):
+            raise ValueError(f'neighbors_file: {twice[0]} is the topic of two neighbors, or also '
+                             'frames_topic: each neighbor must have a pose_topic of its own')
         if self._transforms:
             self._subscribe_transforms(own_frames)
         perceiver.sources.static = StaticChild(node).frames
@@ -105,7 +117,11 @@ class PoseInputs:
             self._subscribed.add(topic)
         if self._frames and self._frames not in self._subscribed:
             for end in self._node.get_publishers_info_by_topic(self._frames):
-                self._subscribe_frames(end.topic_type)
+                try:
+                    self._subscribe_frames(end.topic_type)
+                    self._frames_fault = ''
+                except ValueError as error:
+                    self._frames_fault = str(error)
                 break
 
     def _subscribe_frames(self, msgtype: str) -> None:
@@ -129,10 +145,11 @@ class PoseInputs:
         self._process()
 
     def _take_transforms(self, message: Any) -> None:
-        for stamped in message.transforms:
-            name = self._transforms.get(stamped.child_frame_id)
-            if name is not None:
-                self._use(name, stamped)
+        for_each((stamped for stamped in message.transforms
+                  if stamped.child_frame_id.lstrip('/') in self._transforms), self._take_transform)
+
+    def _take_transform(self, stamped: Any) -> None:
+        self._use(self._transforms[stamped.child_frame_id.lstrip('/')], stamped)
 
     def _take(self, topic: str, name: str, message: Any) -> None:
         if topic in self._contested:
@@ -155,6 +172,8 @@ class PoseInputs:
         self._judged[outcome.name].append((stamp_age(outcome.stamp, now), refused))
 
     def _problem(self, now: float) -> Problem | None:
+        if self._frames_fault:
+            return ERROR, self._frames_fault
         for topic, reason in self._waiting.items():
             if reason:
                 return WARN, f'poses of {self._names[topic]} are not used: {topic}: {reason}'
