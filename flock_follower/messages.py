@@ -174,7 +174,7 @@ class OdometryState(NamedTuple):
 
 
 class OdometryChoice:
-    """Selects the odometry to use: that in the frame ``RELATIVE`` while it is received."""
+    """Selects the odometry to use: states in the frame ``RELATIVE`` while these are received."""
 
     def __init__(self) -> None:
         self._newest: int | None = None

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Message types of ROS 2 Jazzy without ROS, and the conversion of those of ROS 1."""
+"""Message types of ROS 2 Jazzy without ROS, and the conversion of ROS 1 types."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def _maker(msgtype: str) -> Callable[[], Any]:
     """
     Return a function that makes empty messages of a type.
 
-    It is compiled from one expression: calls of a function for each field took three times as
-    long, for every message that is written.
+    The function is compiled from one expression: one call per field took three times as long for
+    every written message.
     """
     names: dict[str, Any] = {'zeros': np.zeros}
     make: Callable[[], Any] = eval(f'lambda: {_expression(msgtype, names)}', names)
@@ -54,7 +54,7 @@ def _maker(msgtype: str) -> Callable[[], Any]:
 
 
 def _expression(msgtype: str, names: dict[str, Any]) -> str:
-    """Return the expression that makes an empty message; ``names`` gets its types."""
+    """Return the expression that makes an empty message; its types are added to ``names``."""
     name = msgtype.replace('/', '_')
     names[name] = typestore().types[msgtype]
     fields = (_zero(description, names) for _, description in typestore().fielddefs[msgtype][1])

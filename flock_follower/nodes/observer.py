@@ -130,7 +130,7 @@ class Observer(Node):
         return load(own or resource('config/neighbors.yaml'))
 
     def _look(self) -> None:
-        """Ask nodes that are new for their parameters, and subscribe to topics that are new."""
+        """Request the parameters of new nodes, and subscribe to new topics."""
         nodes = self._nodes()
         for node in OURS:
             full = full_name(node, self.seen.namespace)
@@ -172,7 +172,7 @@ class Observer(Node):
                     self._take, POSES, topic), best_effort(50))
 
     def _names_of(self, relative_pose: str) -> None:
-        """Take the names of our topics from the subscriptions of relative_pose."""
+        """Read the names of our topics from the subscriptions of relative_pose."""
         namespace, _, name = relative_pose.rpartition('/')
         for topic, types in self.get_subscriber_names_and_types_by_node(name, namespace or '/'):
             ours = BY_TYPE.get(types[0])

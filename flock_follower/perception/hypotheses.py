@@ -75,7 +75,7 @@ class _Motion:
         self._since, self._place = -math.inf, (0.0, 0.0, 0.0)
 
     def take(self, time: float, place: Array) -> None:
-        """Take where it is (3,), m."""
+        """Take its position (3,), m."""
         x, y, z = place.tolist()
         if not 0.0 <= time - self._since <= WINDOW:
             self._since, self._place = time, (x, y, z)
@@ -89,18 +89,18 @@ class Candidate:
     number: int
     track: NeighborFilter
     reachable: bool
-    """Whether the primary track could have reached its first place."""
+    """Whether the primary track could have reached the candidate's first place."""
     motion: _Motion = field(default_factory=_Motion)
     measured: int = 0
-    """Measurements taken in."""
+    """Number of accepted measurements."""
     alone: int = 0
-    """Measurements since the last one of the primary track."""
+    """Number of measurements since the last measurement of the primary track."""
     beside: bool = False
     """Whether the primary track was ever measured in the same image."""
 
     @property
     def confirmed(self) -> bool:
-        """Return whether it is more than a false detection."""
+        """Return whether it has enough measurements, so that it is no false detection."""
         return self.measured >= CONFIRMED
 
     @property
@@ -109,7 +109,7 @@ class Candidate:
         return -math.inf if self.track.newest is None else self.track.newest.stamp
 
     def distance(self, time: float, place: Array) -> float:
-        """Return how far a place (3,), m, is from where it is expected, m."""
+        """Return the distance of a place (3,), m, from the candidate's expected place, m."""
         expected = self.track.place(time) or (self.track.newest and self.track.newest.pose)
         return math.inf if expected is None else math.dist(place, expected.translation)
 
@@ -195,7 +195,7 @@ class Hypotheses:
 
     def _update_primary(self, time: float, measured: Transform, reference: Array,
                         covariance: Array, alike: Array | None) -> UpdateOutcome:
-        """Update the primary track with a measurement, if it can be of it."""
+        """Update the primary track with a measurement, if both can be of one body."""
         last, reach = self.primary.newest, self._reach(time)
         if last is not None and time > last.stamp and self.primary.place(time) is None and (
                 math.dist(measured.translation, last.position) > reach):
@@ -212,7 +212,7 @@ class Hypotheses:
         return outcome
 
     def _reach(self, time: float) -> float:
-        """Return how far from its newest place the primary track can be, m."""
+        """Return the largest possible distance of the primary track from its last place, m."""
         last = self.primary.newest
         return RESTART_TOLERANCE if last is None else (
             RESTART_TOLERANCE + self.params.leader_speed_max * max(time - last.stamp, 0.0))

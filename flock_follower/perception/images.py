@@ -139,7 +139,7 @@ _ENCODINGS |= {wide: (2 * _ENCODINGS[narrow][0], _ENCODINGS[narrow][1])
 
 
 def compute_in_one_thread() -> None:
-    """Keep OpenCV to the calling thread: to wake others cost 6 % of a core, and gained nothing."""
+    """Restrict OpenCV to the calling thread: other threads cost 6 % of a core without a gain."""
     cv2.setNumThreads(1)
 
 

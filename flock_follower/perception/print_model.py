@@ -211,7 +211,7 @@ def _few_wrong(agreeing: Array, brightness: Array, code: CellCode, tracked: bool
 
 
 def _wrong(agreeing: Array) -> float:
-    """Return how many cells, of agreement (n,), are wrong; doubtful ones count in part."""
+    """Return the number of wrong cells by their agreement (n,); doubtful cells count in part."""
     return float(np.clip(0.5 - agreeing, 0.0, 1.0).sum())
 
 
