@@ -128,7 +128,7 @@ class Listener:
         """Take messages to other followers, at a time in ns."""
 
     def reject(self, reason: str, detail: str) -> None:
-        """Take the reason why something was dropped."""
+        """Take the reason for which an input was dropped."""
 
 
 #: After a silence of this, ns, nothing changes any more: the rest of the silence is skipped.
@@ -236,12 +236,12 @@ class Follower:
             self._control.heights.refer(height, self._seconds())
 
     def bridge_died(self, time: int) -> None:
-        """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
+        """Simulate the end of the bridge: no setpoint is sent; the planner keeps its state."""
         self.advance(time)
         self._bridge_ended = self._now
 
     def bridge_started(self, time: int, control: Gate) -> None:
-        """Let a new bridge start, without the state of the one before."""
+        """Simulate the start of a new bridge, without the state of the last bridge."""
         self.advance(time)
         self._control, self._bridge_ended = control, None
         self._announce_bridge_state()
@@ -321,7 +321,7 @@ class Follower:
             self._listener.reject('invalid neighbors', str(error))
 
     def frame(self, time: int, stamp: int) -> None:
-        """Take the stamp of a processed image, ns, with a neighbor in it or not."""
+        """Take the stamp of a processed image, ns, whether or not it shows a neighbor."""
         self.advance(time)
         self._see_frame(stamp)
 
@@ -345,7 +345,7 @@ class Follower:
         self._now = max(self._now, time)
 
     def finish(self) -> None:
-        """Process the images that still wait, without odometry: the inputs have ended."""
+        """Process the waiting images without odometry, because the inputs have ended."""
         while (waited := self._waited()) is not None:
             self._now = max(self._now, waited)
             self._process_due()

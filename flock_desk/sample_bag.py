@@ -80,7 +80,7 @@ class Variant:
 
 
 def _enlarged(width: int, height: int) -> Camera:
-    """Return the sample's lens on a finer sensor, which sees as much from left to right."""
+    """Return the sample's lens on a finer sensor with the same horizontal field of view."""
     small = Camera()
     finer = width / small.width
     return Camera(width, height, finer * small.focal_x, finer * small.focal_y,

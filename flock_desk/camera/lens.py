@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The camera's lens: which ray each pixel sees, and which pixel sees a point."""
+"""The camera's lens: the ray of each pixel, and the pixel of each point."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Camera:
     distortion: tuple[float, ...] = (-0.116, 0.087, 0.0007, -0.0005, 0.0)
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return where the lens shows directions (x, y, 1), before focal lengths and center."""
+        """Return the distorted directions (x, y, 1), before focal lengths and center."""
         r2 = x * x + y * y
         if self.model == 'equidistant':
             radius = np.maximum(np.sqrt(r2), 1e-9)
@@ -93,6 +93,6 @@ class Camera:
 
     @cached_property
     def _reach(self) -> float:
-        """Return a tangent of the angle off the axis a little beyond that of all pixels."""
+        """Return the tangent of an angle off the axis slightly beyond that of all pixels."""
         u, v = (np.array([-0.5, size / 2, size - 0.5]) for size in (self.width, self.height))
         return float(1.1 * np.hypot(*self.rays(*np.meshgrid(u, v))).max())

@@ -16,8 +16,8 @@
 A rendered camera: a leader before its surroundings, through a distorting lens, onto a sensor.
 
 The surroundings are a stored panorama, out of focus and as the middle of the exposure shows it:
-everything but the leader is taken to be far away. Of the leader an image is the mean of poses
-spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
+everything but the leader is taken to be far away. The leader's image is the mean over poses that
+are spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
 center of the top-left pixel.
 """
 
@@ -70,7 +70,7 @@ class Sensor:
     read_noise: float = 12.0
     """Standard deviation, electrons."""
     gain: float = 1.5
-    """Share of the full well that a radiance of 1 fills, in the image's center."""
+    """Share of the full well that a radiance of 1 fills in the image's center."""
     gamma: float = 2.2
     vignetting: float = 0.35
     """Relative light 1 / (1 + this r^2)^2, r the tangent of the angle off axis; 1 is cos^4."""

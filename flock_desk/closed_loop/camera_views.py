@@ -249,7 +249,7 @@ class CameraViews:
         return shown.reshape(-1, m)
 
     def _turning(self, offsets: Array, eyes: Array) -> Array:
-        """Return how fast the others have moved across the images since the last, rad/s."""
+        """Return the angular speed of the others across the image since the last image, rad/s."""
         sight = np.einsum('nji,nj->ni', eyes, offsets)
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         before, self._sight = sight if self._sight is None else self._sight, sight
@@ -289,7 +289,7 @@ def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
 
 T = TypeVar('T')
 _Coming = list[tuple[float, T]]
-"""What has been sent, in the order of sending, and when each arrives, s."""
+"""The sent items, in the order of sending, and their times of arrival, s."""
 
 
 def _due(coming: _Coming[T], now: float) -> list[T]:

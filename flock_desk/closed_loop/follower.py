@@ -140,7 +140,7 @@ class SimulatedFollower(Listener):
         return gate
 
     def sense(self, now: float, own: OwnState | None) -> None:
-        """Take the newest odometry there is."""
+        """Take the newest odometry that has arrived."""
         if own is None or own is self._known or self.failed:
             return
         self._known, to_odom = own, self._T_odom_world
@@ -153,7 +153,7 @@ class SimulatedFollower(Listener):
             pose, twist, _LEVEL_ATTITUDE))
 
     def lean(self, now: float, quaternion: Array) -> OdometryState | None:
-        """Take the attitude by the autopilot; return the motion without odometry, if flown on."""
+        """Take the autopilot's attitude; return the motion without odometry, if it is flown."""
         return None if self.failed else self._follower.attitude(
             to_nanoseconds(now), quaternion, _ZERO_VECTOR)
 
@@ -190,7 +190,7 @@ class SimulatedFollower(Listener):
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
              estimate: Array, altitude: float) -> tuple[Array, float | None]:
         """
-        Let everything happen that is due; return the acceleration and yaw to fly from now on.
+        Process all due events; return the acceleration and yaw to fly from now on.
 
         :param altitude: by its barometer, m.
         """
@@ -262,7 +262,7 @@ class SimulatedFollower(Listener):
         return nominal, self._yaw
 
     def fail(self, now: float) -> None:
-        """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
+        """Simulate the failure of the vehicle's computer: the autopilot then hovers."""
         if not self.failed:
             self.failed, self.decision = True, Decision(State.IDLE)
             self._follower.bridge_died(to_nanoseconds(now))

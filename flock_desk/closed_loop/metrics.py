@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Simulated flights from engaging on: their record at every planner tick, and their figures.
+Simulated flights since ``engage``: their record at every planner tick, and their figures.
 
 All is true, not estimated. Each array has one row per follower, see ``world``. A single follower
 follows the leader. In a flock each follows the edges of its planner; before the first edge, the
@@ -334,7 +334,7 @@ def _stretches(values: Any) -> Any:
 
 
 def _longest(missing: Array, at_the_end: bool = False) -> int:
-    """Return the greatest number of True in a row, or of those at the end."""
+    """Return the greatest number of consecutive True values, or of those at the end."""
     lengths = np.diff(_stretches(missing)).ravel()
     if at_the_end:
         return int(lengths[-1]) if missing[-1] else 0

@@ -49,7 +49,7 @@ _DEGREE = 111_320.0  # m along a meridian
 
 
 class Motion(NamedTuple):
-    """Where a vehicle is at a time and how it moves, ENU and FLU."""
+    """Position, attitude and velocities of a vehicle at a time, ENU and FLU."""
 
     time: int
     """ns."""
@@ -74,7 +74,7 @@ class ExternalMotion:
         self.source = ''
         """Name of the message that places it; '' until a truth comes, or ESTIMATE is set."""
         self.times: list[tuple[float, float]] = []
-        """Own time and the autopilot's since it booted, s: simulators may be slow."""
+        """Our time and the autopilot's time since boot, s: simulators may be slow."""
         self._poses: deque[Motion] = deque(maxlen=MEMORY)
         self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
         self.origin: Array | None = None
@@ -107,7 +107,7 @@ class ExternalMotion:
 
     @property
     def newest(self) -> int | None:
-        """Return until when, ns, the motion is known; None before anything is."""
+        """Return the time, ns, until which the motion is known; None before any motion."""
         return self._poses[-1].time if self._poses else None
 
     def knows(self, time: int) -> bool:
@@ -182,7 +182,7 @@ class ExternalMotion:
 
     def _place(self, now: int, reported: Array, velocity: Array,
                turned: tuple[Array, Array]) -> None:
-        """Add a place by the time of arrival, smoothed by the velocity: its step is 1e-7 deg."""
+        """Add a position of resolution 1e-7 deg, smoothed with the velocity, at its arrival."""
         position = reported
         if self._poses:
             last = self._poses[-1]

@@ -15,8 +15,8 @@
 """
 One bag through perception, planner and gate, and the record of it.
 
-A message comes when it was recorded, so images and odometry are as late, and in the same order,
-as they were in flight. The planner is engaged and the vehicle armed, in the air and in offboard
+Each message is processed at its recording time, so images and odometry have the latency and the
+order of the flight. The planner is engaged and the vehicle armed, in the air and in offboard
 mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
 ``odom`` replace them if ``velocity_source`` requires them.
 """
@@ -223,7 +223,7 @@ class Evaluation(Listener):
         """
         Return whether times step before a message recorded at a time, ns: then begin anew.
 
-        What was computed before the step has no meaning after it. The figures leave it out.
+        Results from before the step are invalid after it. The figures omit the step.
         """
         if not self._gaps.take(time):
             return False

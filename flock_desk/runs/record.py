@@ -105,8 +105,8 @@ class LiveFlight(Flight):
     """
     A flight of a scenario, in the odom frame without drift; its paths are the true ones.
 
-    An image of the table counts as one with the leader in view if the simulator reports that the
-    leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
+    An image of the table counts as "leader in view" if the simulator reports that the leader can
+    be seen and located. ``log`` is the simulator's, see ``FlightLog``, cut to the
     scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
     """
 
@@ -137,7 +137,7 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
     """
     Return a replayed flight; its time begins with the bag's first image.
 
-    What no node published leaves its figures unknown.
+    A figure is unknown if no node published its data.
 
     :param out: the folder of the record and the log of the embedded autopilot.
     :param params: that it was flown with.
