@@ -346,7 +346,7 @@ class Follower:
 
     def finish(self) -> None:
         """Process the waiting images without odometry, because the inputs have ended."""
-        while (waited := self._waited()) is not None:
+        while (waited := self._wait_end()) is not None:
             self._now = max(self._now, waited)
             self._process_due()
 
@@ -356,7 +356,7 @@ class Follower:
         """Return seconds from the first event to a time, or now: near zero, floats are exact."""
         return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
 
-    def _waited(self) -> int | None:
+    def _wait_end(self) -> int | None:
         """Return the time, ns, at which the oldest image stops waiting for odometry, or None."""
         overdue = None if self.perceiver is None else self.perceiver.overdue
         # Rounded up: by then the image has waited long enough in seconds, too.
@@ -365,14 +365,14 @@ class Follower:
 
     def _run_until(self, time: int) -> None:
         while True:
-            times = [self._waited(), self._silence, self._next_tick, self._next_cycle]
+            times = [self._wait_end(), self._silence, self._next_tick, self._next_cycle]
             next_time = min(each for each in times if each is not None)
             if next_time > time:
                 return
             self._now = max(self._now, next_time)
             if next_time == times[0]:
                 self._process_due()
-                if self._waited() == next_time:  # seconds are rounded: long after the start
+                if self._wait_end() == next_time:  # seconds are rounded: long after the start
                     self._now += _ROUNDING
             elif next_time == times[1]:
                 self._silence = None

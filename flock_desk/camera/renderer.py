@@ -188,7 +188,7 @@ class _Panorama:
                     _RAY_SPACING:_RAY_SPACING + self._shape[1]]
 
 
-def _around(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
+def _window_bounds(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
     """Return first and last + 1 column and row (2,) of the part of a window with pixels (n, 2)."""
     return (np.maximum(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN, low),
             np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN, high))
@@ -222,7 +222,7 @@ class _Drawing:
         if not ahead.any():
             return
         pixels = self._camera.project(np.where(ahead[:, None], points, 1.0))
-        low, high = _around(pixels[ahead], 0, (self._camera.width, self._camera.height))
+        low, high = _window_bounds(pixels[ahead], 0, (self._camera.width, self._camera.height))
         if not (low < high).all():
             return
         size = (high - low).tolist()
@@ -243,7 +243,7 @@ class _Drawing:
                 cv2.fillConvexPoly(fine, corners[part], (light[k] * face.value, 1.0),
                                    shift=_SHIFT)
                 continue
-            first, end = _around(pixels[part], low, high)
+            first, end = _window_bounds(pixels[part], low, high)
             if (first < end).all():
                 self._print(_part(fine, first - low, end - low, n),
                             _part(self._rays, first, end), points[part],

@@ -112,7 +112,7 @@ class ExternalMotion:
 
     def knows(self, time: int) -> bool:
         """Return whether the motion at a time, ns, is known: between poses, and near to both."""
-        before, after = self._around(time)
+        before, after = self._adjacent_poses(time)
         return after is not None and (after.time == time or (
             before is not None and after.time - before.time <= POSE_GAP))
 
@@ -126,7 +126,7 @@ class ExternalMotion:
         """
         if not self._poses:
             raise ValueError('no pose has come yet')
-        before, after = self._around(time)
+        before, after = self._adjacent_poses(time)
         b = after or self._poses[-1]
         a = before if before and after else b
         share = 1.0 if a.time == b.time else (time - a.time) / (b.time - a.time)
@@ -134,7 +134,7 @@ class ExternalMotion:
             (a.position, b.position), (a.velocity, b.velocity), (a.angular, b.angular)))
         return Motion(time, position, velocity, slerp(a.quaternion, b.quaternion, share), angular)
 
-    def _around(self, time: int) -> tuple[Motion | None, Motion | None]:
+    def _adjacent_poses(self, time: int) -> tuple[Motion | None, Motion | None]:
         """Return the last pose before a time, and the first that is not."""
         after = None
         for pose in reversed(self._poses):  # the newest are asked for

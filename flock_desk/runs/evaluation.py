@@ -308,7 +308,7 @@ class Evaluation(Listener):
 
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
-        self.errors.odometry(self._moved(state))
+        self.errors.odometry(self._close_gaps(state))
         if self.own is not None and state.stamp < self.bag.start_ns + MAX_DURATION * NANOSECONDS:
             self.own.states.append(state)
 
@@ -357,13 +357,13 @@ class Evaluation(Listener):
     def _seconds(self, nanoseconds: int) -> float:
         return (nanoseconds - self._skipped_ns - self.bag.start_ns) / NANOSECONDS
 
-    def _moved(self, state: OdometryState) -> OdometryState:
+    def _close_gaps(self, state: OdometryState) -> OdometryState:
         """Return a state with its stamp as if the bag had no gaps."""
         return state._replace(stamp=state.stamp - self._skipped_ns) if self._skipped_ns else state
 
     def truth(self, state: OdometryState, own: bool) -> None:
         """Take the true state of the follower, or of a neighbor."""
-        self.errors.truth(self._moved(state), own=own)
+        self.errors.truth(self._close_gaps(state), own=own)
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,

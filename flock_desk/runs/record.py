@@ -232,7 +232,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         paths={name: log[f'{name}_position'] for name in (LEADER_NAME, 'follower')},
         speeds={'follower': (log['state_time'] - began, np.linalg.norm(log['velocity'], axis=1)),
                 'leader': (table['time'], np.linalg.norm(log['leader_velocity'], axis=1))},
-        blind=_hidden(table),
+        blind=_hidden_intervals(table),
         distance=log['distance'][flown(log['distance_time'])],
         setpoint_times=log['setpoint_time'][sent] - began,
         setpoints=log['setpoint_acceleration'][sent],
@@ -255,7 +255,7 @@ def _cut(log: dict[str, Any], images: Any, states: Any, clock: Any) -> None:
             log[name] = log[name][states]
 
 
-def _hidden(table: Table) -> list[tuple[float, float]]:
+def _hidden_intervals(table: Table) -> list[tuple[float, float]]:
     """Return the times, s, in which the leader could not be seen, from and to."""
     times, hidden = table['time'], table['visible'] == 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
