@@ -110,7 +110,7 @@ VARIANTS = {
 
 
 class Recording:
-    """One flight as its topics show it; images are rendered when asked for."""
+    """The topics of one flight; images are rendered on request."""
 
     def __init__(self, variant: Variant, seed: int = 1) -> None:
         self.variant, self.seed = variant, seed

@@ -134,7 +134,7 @@ class SimulatedFollower(Listener):
         """Whether the vehicle flies setpoints."""
 
     def _new_control(self) -> Gate:
-        """Return the control of a bridge that starts."""
+        """Return the setpoint control of a newly started bridge."""
         gate = Gate(self._limits)
         gate.autopilot = AutopilotTraits(needs_wind_offset=not PX4.compensates_wind)
         return gate

@@ -105,7 +105,7 @@ class Quadrotor:
 
     def step(self, dt: float, *, powered: bool = True, wind: ArrayLike = 0.0) -> None:
         """
-        Move on by ``dt``, s.
+        Advance the motion by ``dt``, s.
 
         :param powered: False stops the motors.
         :param wind: velocity of the air (..., 3), m/s, ENU.

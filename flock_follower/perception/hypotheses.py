@@ -145,7 +145,7 @@ class Hypotheses:
         self.primary.reset()
         self._motion = _Motion()
         self._lost: Array | None = None
-        """Where the primary track was before it restarted (3,), m; None if it did not."""
+        """Position (3,), m, of the primary track before its restart; None without a restart."""
         self.candidates: list[Candidate] = []
 
     @property

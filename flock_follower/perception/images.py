@@ -87,7 +87,7 @@ def _png_size(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Return the size in the frame header; before it come segments that begin with a length."""
+    """Return the size in the frame header; earlier segments begin with their length."""
     start = len(_JPEG)
     while start + 9 <= len(data) and data[start] == _JPEG_FILL:
         marker = data[start + 1]

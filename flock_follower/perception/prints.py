@@ -118,7 +118,7 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
 
 
 def with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
-    """Return the markers with a border of two or three cells, and some with one."""
+    """Return the markers with a border of two or three cells, and some with one cell."""
     return concatenate_detections(*(
         everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
 

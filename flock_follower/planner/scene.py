@@ -60,7 +60,7 @@ class Decision(NamedTuple):
 
     state: State
     reason: str = ''
-    """The reason for the state, unless it is TRACK of a neighbor in sight."""
+    """The reason for the state; '' for TRACK of a neighbor in sight."""
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
