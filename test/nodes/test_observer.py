@@ -67,7 +67,7 @@ def test_foreign_poses_are_taken_once_parameters_are_read(
     observer.destroy_node()
 
 
-def test_the_simulator_is_no_other_program():
+def test_the_simulator_is_no_other_program() -> None:
     with subprocess.Popen([sys.executable, '-', 'flock_desk.simulator_node'],
                           stdin=subprocess.PIPE) as simulator:
         ours, with_simulator = ({process for process, *_ in processes(names)}
