@@ -32,7 +32,7 @@ own, its camera on the vehicle of the one before it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
 import math
@@ -45,11 +45,27 @@ import numpy as np
 from flock_desk.closed_loop.real_time_flight import MAX_SKIPPED_SHARE
 from flock_desk.runs.console import guarded, logs_in, within
 from flock_desk.runs.figure_table import bounds, LATE
-from flock_desk.runs.flight import Flown, fly, links, namespaces, own, SIH_TRUTH, spacing
+from flock_desk.runs.flight import (
+    External,
+    Flown,
+    fly,
+    links,
+    namespaces,
+    own,
+    SIH_TRUTH,
+    spacing,
+)
 from flock_desk.runs.judge import FigureBound
+from flock_desk.runs.lock_step import sign_faults
 from flock_desk.runs.moving_picture import moving_picture
 from flock_desk.runs.plots import scenario_chapters
-from flock_desk.runs.processes import explained, failed, LateError
+from flock_desk.runs.processes import (
+    explained,
+    failed,
+    LateError,
+    TOO_BUSY_EXIT_CODE,
+    TooBusyError,
+)
 from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import (
@@ -133,16 +149,43 @@ def _fly(options: argparse.Namespace) -> int:
     with locked(options.output):
         for namespace in ('', *namespaces(options.followers)):
             clear(options.output / namespace)
-        flown = fly(scenario, options.scenario, options.seed, duration, options.output, external,
-                    options.followers, options.detector)
-        with explained(None if failed(flown.exit_codes) else flown.load):
-            code = conclude(scenario, options.output, options.followers, flown)
-            if flown.late and code != 1:
-                raise LateError(flown.late)
+        code = at_any_load(
+            scenario, partial(_fly_and_judge, options, scenario, duration, external))
         if options.moving:
             with whole_file(options.moving) as file:
                 file.write(moving_picture(read_flown(scenario, options.output)))
         return code
+
+
+def _fly_and_judge(options: argparse.Namespace, scenario: Scenario, duration: float,
+                   external: External | None) -> int:
+    flown = fly(scenario, options.scenario, options.seed, duration, options.output, external,
+                options.followers, options.detector)
+    with explained(None if failed(flown.exit_codes) else flown.load):
+        code = conclude(scenario, options.output, options.followers, flown)
+        if flown.late and code != 1:
+            raise LateError(flown.late)
+    return code
+
+
+def at_any_load(scenario: Scenario, command: Callable[[], int]) -> int:
+    """
+    Return the exit code of a flight; judge the signs in lock step if the machine was too busy.
+
+    :raises TooBusyError: from the command, if the signs are right.
+    """
+    busy = None
+    try:
+        code = command()
+    except TooBusyError as error:
+        code, busy = TOO_BUSY_EXIT_CODE, error
+    if code == TOO_BUSY_EXIT_CODE and (faults := sign_faults(scenario)):
+        for fault in faults:
+            print(f'FAILED: {fault}', file=sys.stderr)
+        return 1
+    if busy is not None:
+        raise busy
+    return code
 
 
 def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int:

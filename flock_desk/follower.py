@@ -36,6 +36,7 @@ import math
 from types import MappingProxyType
 from typing import Any, Final
 
+from flock_follower.acceleration_messages import ACCELERATION, from_acceleration, with_acceleration
 from flock_follower.command_messages import Command, from_trajectory, trajectory
 from flock_follower.flock.exchange import Sharing
 from flock_follower.gate.gate import Gate
@@ -44,19 +45,15 @@ from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport, ODOM
 from flock_follower.geometry import Array
 from flock_follower.messages import (
-    ACCELERATION,
-    from_acceleration,
     from_odometry,
     Make,
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
-    RangeState,
     stamp_age,
     STATE,
     to_nanoseconds,
     TRAJECTORY,
-    with_acceleration,
 )
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver
@@ -68,7 +65,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
-from flock_follower.pose_messages import POSE, PoseState
+from flock_follower.pose_messages import POSE, PoseState, RangeState
 
 
 @dataclass

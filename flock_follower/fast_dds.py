@@ -24,11 +24,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 import contextlib
-import fcntl
 import os
 from pathlib import Path
 import pwd
-import time
 from typing import Final
 
 from flock_follower.files import resource
@@ -38,13 +36,11 @@ PROFILE_VARIABLES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_P
 #: Words of every reason of ``undelivered``, by which ``check`` finds its advice.
 UNDELIVERED: Final = 'the transport delivers nothing'
 #: Where the shared memory is, and how the names of its files begin.
-_FOLDER: Final = Path('/dev/shm')
+SHARED_MEMORY: Final = Path('/dev/shm')
 _PREFIXES: Final = ('fastdds_', 'fastrtps_')
 _LOCK_SUFFIX: Final = '_el'
 #: So the kernel marks an open file that was removed.
 _REMOVED: Final = ' (deleted)'
-#: A younger lock may be one whose process is about to lock it, s.
-_YOUNG: Final = 10.0
 
 
 def profile_variables(relative: str) -> dict[str, str]:
@@ -70,18 +66,7 @@ def largest_shared_memory() -> int:
     return max(sizes)
 
 
-def dead_segments(folder: Path = _FOLDER) -> list[Path]:
-    """Return the lock files of shared memory whose processes were killed."""
-    dead = []
-    for path in _locks(folder):
-        with contextlib.suppress(OSError), open(path, 'rb') as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if time.time() - path.stat().st_mtime > _YOUNG:
-                dead.append(path)
-    return dead
-
-
-def undelivered(opened: Iterable[str], user: int, folder: Path = _FOLDER) -> str:
+def undelivered(opened: Iterable[str], user: int, folder: Path = SHARED_MEMORY) -> str:
     """
     Return why this process receives nothing over shared memory, or ''.
 
@@ -97,9 +82,9 @@ def undelivered(opened: Iterable[str], user: int, folder: Path = _FOLDER) -> str
         return (f'{UNDELIVERED}: the shared memory of this node was removed from {folder}, as '
                 'systemd does when a login ends: restart the node')
     others = set()
-    for lock in _locks(folder):
+    for lock in lock_files(folder):
         with contextlib.suppress(OSError):  # removed meanwhile
-            if str(_FOLDER / lock.name) not in own:
+            if str(SHARED_MEMORY / lock.name) not in own:
                 others.add(lock.stat().st_uid)
     if not others:
         return (f'none sending, or {UNDELIVERED}: no other process has shared memory in this '
@@ -112,10 +97,10 @@ def undelivered(opened: Iterable[str], user: int, folder: Path = _FOLDER) -> str
 
 
 def _is_shared_memory(file: Path) -> bool:
-    return file.parent == _FOLDER and file.name.startswith(_PREFIXES)
+    return file.parent == SHARED_MEMORY and file.name.startswith(_PREFIXES)
 
 
-def _locks(folder: Path) -> Iterator[Path]:
+def lock_files(folder: Path) -> Iterator[Path]:
     """Yield the lock files of all processes."""
     for prefix in _PREFIXES:
         yield from folder.glob(f'{prefix}*{_LOCK_SUFFIX}')

@@ -23,7 +23,6 @@ build a message, the caller passes ``make``, which returns an empty message of a
 from __future__ import annotations
 
 from collections.abc import Callable
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +39,6 @@ from flock_follower.ranges import Range
 NANOSECONDS = 1_000_000_000
 _NANOSEC = Range(0, NANOSECONDS - 1, whole=True)
 
-ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 RANGE = 'sensor_msgs/msg/Range'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
@@ -50,8 +48,6 @@ STATE = 'std_msgs/msg/String'
 RELATIVE = 'flock_relative'
 #: Topic on which the bridge publishes that motion during flight without odometry.
 MOTION_TOPIC = 'mavlink/relative'
-#: s without a message in that frame after which odometry is used again.
-RELATIVE_SILENCE = 0.15
 #: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
 RELATIVE_ACCELERATION_MAX = 1.0
 #: Oldest image that such a command may rest on, s.
@@ -173,46 +169,6 @@ class OdometryState(NamedTuple):
         return turned
 
 
-class OdometryChoice:
-    """Selects the odometry to use: states in the frame ``RELATIVE`` while these are received."""
-
-    def __init__(self) -> None:
-        self._newest: int | None = None
-
-    def takes(self, state: OdometryState) -> bool:
-        """Return whether to use a state."""
-        if state.frame == RELATIVE:
-            self._newest = state.stamp
-        if self._newest is None or state.frame == RELATIVE:
-            return True
-        later = (state.stamp - self._newest) / NANOSECONDS
-        return not -MAX_JUMP <= later <= RELATIVE_SILENCE
-
-
-class RangeState(NamedTuple):
-    """
-    A Range message in numbers.
-
-    ``stamp`` ns; ``name`` of the neighbor it is to; ``distance``, m; ``limits`` between which it
-    is valid, m, both 0 if unknown; ``variance``, m^2, 0 if unknown.
-    """
-
-    stamp: int
-    name: str
-    distance: float
-    limits: tuple[float, float] = (0.0, 0.0)
-    variance: float = 0.0
-
-
-def from_range(message: Any) -> RangeState:
-    """Return the fields of a Range message; they are not checked."""
-    variance = float(getattr(message, 'variance', 0.0))  # older bags have none
-    return RangeState(
-        read_stamp(message.header.stamp), message.header.frame_id, float(message.range),
-        (float(message.min_range), float(message.max_range)),
-        variance if 0.0 < variance < math.inf else 0.0)
-
-
 def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
     """
     Return the state of an Odometry message, its velocity in the header's frame.
@@ -271,53 +227,6 @@ def from_state(make: Make, state: OdometryState) -> Any:
     return odometry(make, state.stamp, state.frame, state.child, state.position,
                     state.quaternion, to_child.dot(state.velocity), state.angular_velocity,
                     state.pose_covariance, twist)
-
-
-def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
-                 covariance: ArrayLike) -> Any:
-    """
-    Return an AccelWithCovarianceStamped of a neighbor, in its own frame ``child``.
-
-    ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). Its angular part is not known:
-    its covariance is -1.
-    """
-    message = make(ACCELERATION)
-    set_stamp(message.header.stamp, stamp)
-    message.header.frame_id = child
-    set_vector(message.accel.accel.linear, vector)
-    full = np.zeros((6, 6))
-    full[:3, :3], full[3, 3] = covariance, -1.0
-    message.accel.covariance = full.reshape(36)
-    return message
-
-
-class AccelerationState(NamedTuple):
-    """A neighbor's acceleration (3,), m/s^2, in its own frame ``child``, at a stamp, ns."""
-
-    stamp: int
-    child: str
-    vector: Array
-
-
-def from_acceleration(message: Any) -> AccelerationState:
-    """
-    Return the acceleration in an AccelWithCovarianceStamped of a neighbor.
-
-    :raises ValueError: if the acceleration is not finite, or beyond ``SANE``.
-    """
-    linear = message.accel.accel.linear
-    vector = np.array([linear.x, linear.y, linear.z], dtype=float)
-    if not np.all(np.abs(vector) <= SANE):  # NaN fails
-        raise ValueError(f'acceleration of {message.header.frame_id}: {vector.tolist()}: must be '
-                         f'finite, and at most {SANE:g} m/s^2')
-    return AccelerationState(
-        read_stamp(message.header.stamp), message.header.frame_id, vector)
-
-
-def with_acceleration(state: OdometryState, acceleration: AccelerationState) -> OdometryState:
-    """Return a neighbor's state with an acceleration given in the neighbor's frame."""
-    return state._replace(
-        acceleration=quaternion_to_matrix(state.quaternion) @ acceleration.vector)
 
 
 def twist(make: Make, linear: ArrayLike) -> Any:

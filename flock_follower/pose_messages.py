@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Conversion of poses of neighbors to messages of other packages and back; see ``messages``."""
+"""Poses of neighbors, and ranges to them, as messages of other packages; see ``messages``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+import math
 import struct
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -117,6 +118,31 @@ def from_pose(message: Any) -> PoseState:
         place, turn = pose.position, pose.orientation
     return PoseState(read_stamp(message.header.stamp), message.header.frame_id, to_array(place),
                      np.array([turn.x, turn.y, turn.z, turn.w]), covariance)
+
+
+class RangeState(NamedTuple):
+    """
+    A Range message in numbers.
+
+    ``stamp`` ns; ``name`` of the neighbor it is to; ``distance``, m; ``limits`` between which it
+    is valid, m, both 0 if unknown; ``variance``, m^2, 0 if unknown.
+    """
+
+    stamp: int
+    name: str
+    distance: float
+    limits: tuple[float, float] = (0.0, 0.0)
+    variance: float = 0.0
+
+
+def from_range(message: Any) -> RangeState:
+    """Return the fields of a Range message; they are not checked."""
+    variance = float(getattr(message, 'variance', 0.0))  # older bags have none
+    return RangeState(
+        read_stamp(message.header.stamp), message.header.frame_id, float(message.range),
+        (float(message.min_range), float(message.max_range)),
+        variance if 0.0 < variance < math.inf else 0.0)
+
 
 def stamp_of(data: bytes) -> int:
     """

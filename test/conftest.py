@@ -28,6 +28,7 @@ A test with ``ros`` that fails while other programs had the processors says so.
 
 import ast
 from functools import cache
+import gc
 import json
 import os
 from pathlib import Path
@@ -58,6 +59,9 @@ os.environ['VIEW'] = 'no'  # flights start no live page
 os.environ.setdefault('OPENCV_FOR_THREADS_NUM', '1')
 # Nodes find each other in a fifth of a second instead of up to 2.5 s.
 os.environ.update(profile_variables('config/dds/fastdds.xml'))
+
+# What collecting makes stays to the end: to look for garbage in it takes a fifth of that time.
+gc.disable()
 
 #: The tests that run unless paths or markers are given.
 FAST = 'unit or linter'
@@ -95,6 +99,11 @@ def may_use_ros(path):
             or re.search(r'\bros\b', path.read_text()) is not None)
 
 
+def may_be_slow(path):
+    """Whether a module of tests may have some with the marker ``slow``."""
+    return re.search(r'\bslow\b', path.read_text()) is not None
+
+
 def is_slow(path):
     """Whether a module says of all its tests that they are slow."""
     return 'pytestmark = pytest.mark.slow' in path.read_text().splitlines()
@@ -109,9 +118,29 @@ def pytest_ignore_collect(collection_path, config):
         return True
     if asked.startswith('ros') and not may_use_ros(collection_path):
         return True
+    if asked.startswith('ros and slow') and not may_be_slow(collection_path):
+        return True
     if asked in ('unit', FAST, 'not slow') and is_slow(collection_path):
         return True
     return None  # others may have reasons to leave it out
+
+
+class FromTheEnd(pytest.Dir):
+    """A folder whose last module is loaded first."""
+
+    def collect(self):
+        return reversed([*super().collect()])
+
+
+def pytest_collect_directory(path, parent):
+    """
+    Let the second worker load the modules from the last one on.
+
+    In a fresh clone the asserts of each module are rewritten once, by the worker that comes first.
+    """
+    if os.environ.get('PYTEST_XDIST_WORKER') == 'gw1':
+        return FromTheEnd.from_parent(parent, path=path)
+    return None
 
 
 def pytest_collection_modifyitems(items):
@@ -122,7 +151,13 @@ def pytest_collection_modifyitems(items):
             item.add_marker('ros')
         if not any(item.get_closest_marker(name) for name in ('ros', 'slow', 'sweep', 'linter')):
             item.add_marker('unit')
-    items.sort(key=lambda item: item.get_closest_marker('slow') is None)
+    items.sort(key=lambda item: (item.get_closest_marker('slow') is None, item.path))
+
+
+def pytest_collection_finish():
+    """Look for garbage again, but only in what the tests make."""
+    gc.freeze()
+    gc.enable()
 
 
 def family(process):

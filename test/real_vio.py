@@ -35,7 +35,7 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Tran
 from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.look import View
+from flock_follower.perception.look import CameraMotion
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.square_pose import ippe, refine
@@ -179,7 +179,7 @@ def seen_tags(recording: Recording, read: Read,
             began[tag.number], visits[tag.number] = time, visits.get(tag.number, 0) + 1
         if change := offset.take(str(tag.number), time, pose.translation, T_base_camera,
                                  buffer):
-            view = View.of(own, T_base_camera)
+            view = CameraMotion.of(own, T_base_camera)
             for other in filters.values():
                 if other.newest is not None:
                     other.shift(change * view.moving(other.newest.position - own.travel))

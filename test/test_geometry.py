@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower import geometry as geo
+from flock_follower import ned
 
 finite = st.floats(-1e3, 1e3)
 vectors = arrays(float, 3, elements=finite)
@@ -34,29 +35,29 @@ def same_rotation(q1, q2):
 
 
 def test_north_in_enu_is_the_first_ned_axis_and_up_is_minus_down():
-    np.testing.assert_array_equal(geo.enu_to_ned([1.0, 2.0, 3.0]), [2.0, 1.0, -3.0])
+    np.testing.assert_array_equal(ned.enu_to_ned([1.0, 2.0, 3.0]), [2.0, 1.0, -3.0])
 
 
 @pytest.mark.parametrize(
-    'enu, ned', [(0.0, math.pi / 2), (math.pi / 2, 0.0), (math.pi, -math.pi / 2)])
-def test_enu_yaw_becomes_ned_yaw(enu, ned):
-    assert math.isclose(geo.yaw_enu_to_ned(enu), ned, abs_tol=1e-12)
+    'enu, expected', [(0.0, math.pi / 2), (math.pi / 2, 0.0), (math.pi, -math.pi / 2)])
+def test_enu_yaw_becomes_ned_yaw(enu, expected):
+    assert math.isclose(ned.yaw_enu_to_ned(enu), expected, abs_tol=1e-12)
 
 
 @given(vectors, angles, quaternions)
 def test_vectors_yaw_attitude_survive_enu_ned_round_trip(v, yaw, q):
-    np.testing.assert_array_equal(geo.ned_to_enu(geo.enu_to_ned(v)), v)
-    np.testing.assert_array_equal(geo.frd_to_flu(geo.flu_to_frd(v)), v)
-    assert abs(geo.wrap_angle(geo.yaw_ned_to_enu(geo.yaw_enu_to_ned(yaw)) - yaw)) < 1e-9
+    np.testing.assert_array_equal(ned.ned_to_enu(ned.enu_to_ned(v)), v)
+    np.testing.assert_array_equal(ned.frd_to_flu(ned.flu_to_frd(v)), v)
+    assert abs(geo.wrap_angle(ned.yaw_ned_to_enu(ned.yaw_enu_to_ned(yaw)) - yaw)) < 1e-9
     assert same_rotation(
-        geo.quaternion_ned_frd_to_enu_flu(geo.quaternion_enu_flu_to_ned_frd(q)), q)
+        ned.quaternion_ned_frd_to_enu_flu(ned.quaternion_enu_flu_to_ned_frd(q)), q)
 
 
 @given(quaternions, vectors)
 def test_ned_attitude_takes_body_vector_to_same_place(q, v):
     in_enu = geo.quaternion_to_matrix(q) @ v
-    in_ned = geo.quaternion_to_matrix(geo.quaternion_enu_flu_to_ned_frd(q)) @ geo.flu_to_frd(v)
-    np.testing.assert_allclose(in_ned, geo.enu_to_ned(in_enu), atol=1e-9)
+    in_ned = geo.quaternion_to_matrix(ned.quaternion_enu_flu_to_ned_frd(q)) @ ned.flu_to_frd(v)
+    np.testing.assert_allclose(in_ned, ned.enu_to_ned(in_enu), atol=1e-9)
 
 
 @given(quaternions)

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flock_follower.acceleration_messages import acceleration, from_acceleration
 from flock_follower.bags.message_types import empty
 from flock_follower.command_messages import Command, from_trajectory, trajectory
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import (
-    acceleration,
-    from_acceleration,
     from_odometry,
     from_state,
     Make,

@@ -23,7 +23,7 @@ gate, as ``follower.Follower``. The embedded PX4 flies the setpoints.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -59,6 +59,7 @@ from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.tracker import Tracker
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
+from flock_follower.planner.params import Member
 from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseState
 from flock_follower.ranges import parameter, Range
 
@@ -68,6 +69,7 @@ CAMERA_FRAME = 'camera_optical_frame'
 REPORT_STEPS = 5  # of the autopilot, between two reports of velocity, attitude and height
 STATUS_STEPS = 50  # of the autopilot, between two reports of its mode
 REQUEST_TIME = 1.0  # s: offboard and engage are called then
+GAP_PERIOD = 5.0  # s: poses are missing at its end
 LATENCY_SPREAD = 0.1  # share by which a single latency differs at the most
 
 
@@ -82,14 +84,27 @@ class Detector(Part):
     outlier: float = parameter(1.0, Range(0.0, 10.0, 'm'), 'Length of their error, m.')
     position_std: float = parameter(0.03, Range(0.001, 1.0, 'm'), 'Per axis, m.')
     attitude_std: float = parameter(0.1, Range(0.001, 1.0, 'rad'), 'Per axis, rad.')
+    gap: float = parameter(
+        0.0, Range(0.0, 5.0, 's'), f'Time without a pose in each {GAP_PERIOD:g} s, s.')
+    stamp_error: float = parameter(
+        0.0, Range(-0.2, 0.2, 's'), 'By which stamps are later than the exposure, s.')
     position_only: bool = parameter(False, None, 'Whether the attitude is not used.')
 
 
-#: Detectors by name.
+_DEGRADED = Detector(rate=10.0, latency=0.15, missing=0.2, outliers=0.05)
+#: Detectors by name; those after 'degraded' are degraded further in one respect.
 DETECTORS = {
     'full pose': Detector(),
     'position only': Detector(position_only=True),
-    'degraded': Detector(rate=10.0, latency=0.15, missing=0.2, outliers=0.05),
+    'degraded': _DEGRADED,
+    '5 Hz': replace(_DEGRADED, rate=5.0),
+    '0.3 s late': replace(_DEGRADED, latency=0.3),
+    '40 % missing': replace(_DEGRADED, missing=0.4),
+    'gaps of 0.5 s': replace(_DEGRADED, gap=0.5),
+    'outliers of 0.3 m': replace(_DEGRADED, outlier=0.3),
+    'outliers of 3 m': replace(_DEGRADED, outlier=3.0),
+    'stamps 50 ms late': replace(_DEGRADED, stamp_error=0.05),
+    'stamps 50 ms early': replace(_DEGRADED, stamp_error=-0.05),
 }
 
 
@@ -135,7 +150,8 @@ class DetectorFlight(Listener):
             'name': LEADER, 'pose_topic': 'poses', 'position_only': detector.position_only}]}),
             T_BODY_OPTICAL, params)
         self._follower = Follower(
-            PlannerLoop(), scenario.flight.planner(True), gate, self, make,
+            PlannerLoop(), replace(scenario.flight.planner(True), vehicles={
+                LEADER: Member(faces=())}), gate, self, make,
             perceiver=Perceiver(tracker, max_wait=MAX_WAIT))
         self._coming: list[tuple[float, int, PoseState | None]] = []
         """Results under way: when each arrives, s, the stamp of its image, ns, and the pose."""
@@ -226,19 +242,20 @@ class DetectorFlight(Listener):
         found, away = random.normal(size=6), random.normal(size=3)
         missing, odd = random.random(2).tolist()
         latency = detector.latency * (1.0 + LATENCY_SPREAD * random.uniform(-1.0, 1.0))
-        pose = None
+        pose, stamp = None, EPOCH_NS + image.stamp_ns + round(detector.stamp_error * NANOSECONDS)
+        in_gap = image.stamp_ns * 1e-9 % GAP_PERIOD >= GAP_PERIOD - detector.gap
         if leader is not None and image.usable and missing >= detector.missing and (
-                self._in_sight(image.follower, leader)):
+                not in_gap and self._in_sight(image.follower, leader)):
             deviations = np.repeat([detector.position_std, detector.attitude_std], 3)
             error = deviations * found
             if odd < detector.outliers:
                 error[:3] += detector.outlier * away / np.linalg.norm(away)
             true = (body_pose(image.follower) @ T_BODY_OPTICAL).inverse() @ body_pose(leader)
             pose = from_pose(pose_with_covariance(
-                self._make, EPOCH_NS + image.stamp_ns, CAMERA_FRAME,
+                self._make, stamp, CAMERA_FRAME,
                 Transform(rotation_vector_to_matrix(error[3:]) @ true.rotation,
                           true.translation + error[:3]), np.diag(deviations**2)))
-        self._coming.append((image.stamp_ns * 1e-9 + latency, EPOCH_NS + image.stamp_ns, pose))
+        self._coming.append((image.stamp_ns * 1e-9 + latency, stamp, pose))
 
     def _in_sight(self, follower: Odometry, leader: Odometry) -> bool:
         """Return whether the leader is in the image, and shows its back."""
@@ -261,6 +278,7 @@ class DetectorFlight(Listener):
             return
         now = self._flight.time_ns * 1e-9
         message = encode_setpoint(setpoint.acceleration, setpoint.yaw, round(now * 1e3))
+        self._vehicle.log.received(message, now)
         self._vehicle.autopilot.controller.on_setpoint(message, now)
         if self._has_begun:
             self._accelerations.append(math.hypot(message.afx, message.afy, message.afz))

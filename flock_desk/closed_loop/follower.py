@@ -37,6 +37,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.follower import ControlCycle, Follower, Listener, Tick
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import ENGAGE_TIME, Operation, Scenario, VioErrors
+from flock_follower.acceleration_messages import AccelerationState, with_acceleration
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
 from flock_follower.gate.envelope import GateLimits
@@ -51,19 +52,13 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 from flock_follower.mavlink.dialects import PX4
-from flock_follower.messages import (
-    AccelerationState,
-    OdometryState,
-    RELATIVE,
-    to_nanoseconds,
-    with_acceleration,
-)
+from flock_follower.messages import OdometryState, RELATIVE, to_nanoseconds
 from flock_follower.perception.neighbor_motion import POSITION, VELOCITY
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
-from flock_follower.planner.sight import View
+from flock_follower.planner.sight import FieldsOfView
 from flock_follower.planner.step import Decision
 
 _TICK_DELAY_NS = 1  # ns by which ticks come after the messages of their moment
@@ -92,7 +87,7 @@ class SimulatedFollower(Listener):
     """
 
     def __init__(self, scenario: Scenario, guard: bool, frame: str, T_odom_world: Transform,
-                 start: Array, view: View, name: str, law: type[FlockingParams]) -> None:
+                 start: Array, view: FieldsOfView, name: str, law: type[FlockingParams]) -> None:
         # Scenarios judge the planner in open space: the bounds of the envelope are far.
         self._limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
                                   height_max=1000.0, radius_max=10000.0,

@@ -54,7 +54,6 @@ from flock_follower.geometry import Array
 from flock_follower.mavlink.parameter_table import gate_limits
 from flock_follower.messages import (
     from_odometry,
-    from_range,
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
@@ -72,7 +71,7 @@ from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.parameter_table import planner_params
-from flock_follower.pose_messages import from_pose, POSE_TYPES, stamp_of
+from flock_follower.pose_messages import from_pose, from_range, POSE_TYPES, stamp_of
 from flock_follower.topic_names import (
     COMPRESSED_IMAGES,
     full_name,

@@ -23,7 +23,7 @@ on the flight (reasons, outages, processes) are named by their last part.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 import math
 import re
 from typing import Final, NamedTuple
@@ -194,15 +194,18 @@ def shown(key: str) -> bool:
     return any(group in FIGURES and FIGURES[group].shown for group in groups)
 
 
-def bounds(command: str, limits: Mapping[str, float]) -> dict[str, FigureBound]:
+def bounds(command: str, limits: Mapping[str, float],
+           keys: Iterable[str] = FIGURES) -> dict[str, FigureBound]:
     """
     Return the bounds of a command by key.
 
     :param command: 'demo', 'fly' or 'external'.
     :param limits: the values of the limits that the table names.
+    :param keys: the figures to judge, by default all.
     """
     found = {}
-    for key, figure in FIGURES.items():
+    for key in keys:
+        figure = FIGURES[key]
         ends = figure.demo if command == 'demo' else figure.fly
         if command == 'external':
             ends = figure.external or ends

@@ -149,14 +149,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
                   namespace, show=i == 0)
         start_view(processes, fleet[0])
         try:
-            for namespace in reversed(fleet):  # the first one flies off when it is engaged
-                prefix = f'/{namespace}/' if namespace else ''
-                if external:
-                    take_off(processes)
-                else:
-                    call(processes, f'{prefix}mavlink_bridge/arm')
-                call(processes, f'{prefix}mavlink_bridge/offboard')
-                call(processes, f'{prefix}planner/engage')
+            engage(processes, fleet, external is not None)
             began = time.monotonic()
             cores, late = watch(processes, duration, external is not None)
             early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
@@ -182,6 +175,18 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             if code == 1 and recorder.endswith('recorder'):
                 raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
         return Flown(cores, exit_codes, processes.load.worst(began), late)
+
+
+def engage(processes: Processes, fleet: Sequence[str], external: bool) -> None:
+    """Arm or take off, request offboard, and engage all followers of the namespaces."""
+    for namespace in reversed(fleet):  # the first one flies off when it is engaged
+        prefix = f'/{namespace}/' if namespace else ''
+        if external:
+            take_off(processes)
+        else:
+            call(processes, f'{prefix}mavlink_bridge/arm')
+        call(processes, f'{prefix}mavlink_bridge/offboard')
+        call(processes, f'{prefix}planner/engage')
 
 
 def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorded: Sequence[str],

@@ -38,6 +38,7 @@ import time
 from types import FrameType, TracebackType
 from typing import TypeVar
 
+from flock_follower.checks.dead_segments import dead_segments
 from flock_follower.checks.processor import (
     Load,
     LOAD_PERIOD,
@@ -47,7 +48,7 @@ from flock_follower.checks.processor import (
     stopped,
     threads_of,
 )
-from flock_follower.fast_dds import dead_segments, profile_variables
+from flock_follower.fast_dds import profile_variables
 from flock_follower.signals import ending
 
 TOO_BUSY_EXIT_CODE = 3

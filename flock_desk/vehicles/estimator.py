@@ -34,16 +34,14 @@ from flock_desk.vehicles.profiles import Profile
 from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import (
     Array,
-    frd_to_flu,
-    ned_to_enu,
     normalize_quaternion,
     quaternion_from_yaw,
     quaternion_multiply,
-    quaternion_ned_frd_to_enu_flu,
     quaternion_to_matrix,
     wrap_angle,
     yaw_from_quaternion,
 )
+from flock_follower.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
 
 #: A gap in the vision longer than this, s, makes it stale: PX4's EKF2 stops using it then.
 VISION_TIMEOUT: Final[float] = 0.2

@@ -21,7 +21,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_follower.geometry import Array, ned_to_enu, yaw_ned_to_enu
+from flock_follower.geometry import Array
+from flock_follower.ned import ned_to_enu, yaw_ned_to_enu
 from flock_follower.whole_file import whole_file
 
 #: The true state is logged this often, Hz.
@@ -86,17 +87,21 @@ class FlightLog:
         elif kind == 'ODOMETRY':
             self.add(kind, now, message.time_usec, message.frame_id)
 
+    def arrays(self) -> dict[str, Any]:
+        """Return the columns by name."""
+        columns: dict[str, Any] = {
+            name: np.array([row[i] for row in rows]) for kind, rows in self._rows.items()
+            for i, name in enumerate(_COLUMNS[kind])}
+        columns['setpoint_acceleration'] = columns['setpoint_acceleration'].reshape(-1, 3)
+        return columns
+
     def save(self, path: str, **more: Any) -> None:
         """
         Write the log, and more arrays, to a .npz file, whole or not at all.
 
         :raises OSError: naming the file, if it cannot be written.
         """
-        columns: dict[str, Any] = {
-            name: np.array([row[i] for row in rows]) for kind, rows in self._rows.items()
-            for i, name in enumerate(_COLUMNS[kind])}
-        columns['setpoint_acceleration'] = columns['setpoint_acceleration'].reshape(-1, 3)
         packed = BytesIO()
-        np.savez_compressed(packed, **columns, **more)
+        np.savez_compressed(packed, **self.arrays(), **more)
         with whole_file(path) as file:
             file.write(packed.getbuffer())

@@ -42,37 +42,32 @@ def empty(msgtype: str) -> Any:
 
 @cache
 def _maker(msgtype: str) -> Callable[[], Any]:
-    """
-    Return a function that makes empty messages of a type.
+    """Return a function that makes empty messages of a type."""
+    fields = [_zero(description) for _, description in typestore().fielddefs[msgtype][1]]
+    makers = [(k, field) for k, field in enumerate(fields) if callable(field)]
+    message_type = typestore().types[msgtype]
 
-    The function is compiled from one expression: one call per field took three times as long for
-    every written message.
-    """
-    names: dict[str, Any] = {'zeros': np.zeros}
-    make: Callable[[], Any] = eval(f'lambda: {_expression(msgtype, names)}', names)
+    def make() -> Any:
+        values = fields.copy()
+        for k, field in makers:
+            values[k] = field()
+        return message_type(*values)
     return make
 
 
-def _expression(msgtype: str, names: dict[str, Any]) -> str:
-    """Return the expression that makes an empty message; its types are added to ``names``."""
-    name = msgtype.replace('/', '_')
-    names[name] = typestore().types[msgtype]
-    fields = (_zero(description, names) for _, description in typestore().fielddefs[msgtype][1])
-    return f'{name}({", ".join(fields)})'
-
-
-def _zero(description: Any, names: dict[str, Any]) -> str:
-    """Return the expression that makes an empty value of a field."""
+def _zero(description: Any) -> Any:
+    """Return the empty value of a field; a function that makes one if it can be changed."""
     kind, detail = description
     if kind == Nodetype.NAME:
-        return _expression(detail, names)
+        return _maker(detail)
     if kind == Nodetype.BASE:
-        return repr(_ZEROS.get(detail[0], 0))
+        return _ZEROS.get(detail[0], 0)
     element, length = detail
     count = length if kind == Nodetype.ARRAY else 0
     if element[0] == Nodetype.BASE and element[1][0] != 'string':
-        return f'zeros({count}, {_BYTES.get(element[1][0], element[1][0])!r})'
-    return f'[{", ".join(_zero(element, names) for _ in range(count))}]'
+        return np.zeros(count, _BYTES.get(element[1][0], element[1][0])).copy
+    one = _zero(element)
+    return lambda: [one() if callable(one) else one for _ in range(count)]
 
 
 def migration_obstacle(msgtype: str, definition: str) -> str | None:

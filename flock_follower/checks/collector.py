@@ -45,10 +45,11 @@ from flock_follower.parameters.sections import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
-from flock_follower.perception.markers import concatenate_detections, Detections
+from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import PosePrior
+from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pose import locate, target
-from flock_follower.perception.prints import turned_print, with_wide_borders, wrong_border
+from flock_follower.perception.prints import BORDER_WIDTHS, turned_print, wrong_border
 from flock_follower.perception.search import everywhere
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pose_messages import from_pose
@@ -188,9 +189,9 @@ class Collector:
         thoroughly = partial(everywhere, markers=[marker for _, marker in markers.values()])
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary)
-            for search in (thoroughly, with_wide_borders):  # which take longer
+            for search in (thoroughly, _with_wide_borders):  # which take longer
                 if not markers.keys() & set(found.ids.tolist()):
-                    found = concatenate_detections(found, search(pixels, config.dictionary))
+                    found = _concatenate(found, search(pixels, config.dictionary))
             fits = camera is not None and pixels.shape == (camera.height, camera.width)
             up = _upwards(seen, path, picture.stamp) if len(found.ids) else None
             seen.sightings += self._measure(
@@ -204,12 +205,15 @@ class Collector:
         seen.frames_topic = config.frames_topic
         mounting = camera_mounting(*(seen.value('relative_pose', name, [0.0, 0.0, 0.0])
                                      for name in ('camera_position', 'camera_rpy')))
+        if all(n.source is None for n in config.neighbors):
+            seen.sources = {}
+            return
         seen.sources = judge_poses(
             config, {n.name: self._poses.get(full_name(n.source.topic, seen.namespace), [])
                      for n in config.neighbors if n.source is not None and n.source.topic},
             seen.own.states if seen.own else [],
             {frame.frame_id: mounting} if frame is not None and frame.frame_id else {},
-            seen.static) if any(n.source is not None for n in config.neighbors) else {}
+            seen.static, seen.value('relative_pose', 'max_wait', MAX_WAIT))
 
     def _measure(self, picture: Picture, pixels: GrayImage, camera: CameraModel | None,
                  found: Detections, config: NeighborConfig, up: Array | None
@@ -269,3 +273,15 @@ def _upwards(seen: Observations, path: OwnPath | None, stamp: float) -> Array | 
     R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
     up: Array = (quaternion_to_matrix(quaternions[0]) @ R_base_optical)[2]
     return up if known[0] else None
+
+
+def _with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
+    """Return the markers with a border of two or three cells, and some with one."""
+    return _concatenate(*(
+        everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
+
+
+def _concatenate(*found: Detections) -> Detections:
+    """Return all the markers of several searches."""
+    return Detections(np.concatenate([each.ids for each in found]),
+                      np.concatenate([each.corners for each in found]))

@@ -237,6 +237,8 @@ STEP_TIME: Final[float] = 0.2
 STEP_SAMPLES: Final[int] = 3
 #: For this long, s, after a jump the vehicle brakes.
 STEP_PAUSE: Final[float] = 1.0
+#: Change between two altitudes, m, that the sensor alone can make: a table, a wall, a door.
+SENSOR_LEAP: Final[float] = 0.5
 #: Pressure of the standard atmosphere (ISO 2533) at sea level, hPa.
 SEA_LEVEL_PRESSURE: Final[float] = 1013.25
 #: Altitude at which the formula of that atmosphere has no pressure, m.
@@ -257,7 +259,10 @@ class HeightEstimator:
 
     def __init__(self) -> None:
         self.stepped = -math.inf
-        """Time of the last jump of the sensor, and of the reference with it, s."""
+        """When the sensor, and so the reference, has jumped last, s."""
+        self.leapt = -math.inf
+        """When two altitudes in a row differed by more than SENSOR_LEAP last, s."""
+        self._newest = math.nan  # altitude by the sensor, m
         self._altitude = 0.0
         self._velocity_error = 0.0
         self._reported: float | None = None
@@ -289,6 +294,8 @@ class HeightEstimator:
             if before is None:
                 self._reference = None
         altitude -= self._zero
+        self.leapt = now if abs(altitude - self._newest) > SENSOR_LEAP else self.leapt
+        self._newest = altitude
         if elapsed > HEIGHT_TIMEOUT:
             # A sensor that returns is used again, with the same reference.
             self._altitude, self._velocity_error, self._began = altitude, 0.0, now

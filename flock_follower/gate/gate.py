@@ -214,6 +214,9 @@ class Gate:
         refused = self.heights.take(altitude, None if velocity is None else float(
             velocity.vector[2]), now, sensor)
         height = self.heights.altitude(now)
+        if self.heights.stepped == now and now - self.heights.leapt <= envelope.STEP_TIME:
+            # Not the odometry: its velocity errs more slowly.
+            self.motion.forget_heights()
         if not refused and height is not None:
             self.motion.take_height(height, now)
         return refused

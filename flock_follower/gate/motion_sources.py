@@ -69,6 +69,7 @@ class MotionSources:
         self._choice = choice
         self._sources = {ODOM: Source(), AUTOPILOT: Source()}
         self._height_path = Path()
+        self._handed_on: Array | float = 0.0  # m, from the position of odom to the path followed
         self._comparison = VelocityComparison()
         self._distrusted_since = math.inf
         self._displaced_since = math.inf
@@ -90,7 +91,8 @@ class MotionSources:
     @property
     def position(self) -> Array | None:
         """Return the position (3,), m, by the source, without its jumps; None if unknown."""
-        return self._sources[self.source].path.position
+        position = self._sources[self.source].path.position
+        return None if position is None else position + self._handed_on
 
     def take(self, source: str, report: MotionReport, age: float, max_age: float,
              now: float) -> str:
@@ -99,10 +101,15 @@ class MotionSources:
         if v is None:
             return 'not finite' if finite_vector(report.velocity) is None else 'too fast'
         if not (refused := refusal(age, max_age)):
+            by, before = self.source, self.position
             time = now - max(age, 0.0)
             known.take_velocity(v, time)
             known.take_yaw(report.yaw, time)
             known.take_position(report.position, time, report.std, max_age)
+            now_at = self.position
+            if by != self.source and before is not None and now_at is not None:
+                # Odometry takes over, in a frame of its own: the vehicle has not moved by that.
+                self._handed_on = before - now_at
         return refused
 
     def take_position(self, source: str, position: ArrayLike, time: float,
@@ -117,6 +124,10 @@ class MotionSources:
     def take_height(self, height: float, now: float) -> None:
         """Take a height by the barometer, m."""
         self._height_path.take(np.array([0.0, 0.0, height]), None, now)
+
+    def forget_heights(self) -> None:
+        """Begin the heights anew: the sensor has jumped."""
+        self._height_path = Path()
 
     def fresh_yaw(self, max_age: float, now: float) -> float | None:
         """Return the autopilot's yaw, rad, or odom's if the autopilot's is not fresh, or None."""

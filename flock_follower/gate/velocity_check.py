@@ -256,6 +256,9 @@ class VelocityComparison:
 DISPLACEMENT_WINDOW: Final[float] = 5.0
 #: Displacements may differ by this, m, or by 3 standard deviations if those are more.
 TOLERANCE: Final[float] = 0.5
+#: Odometry that reports a larger standard deviation of its position, m, counts with this one: the
+#: drift since the start grows without limit, and that of a few seconds does not.
+ODOMETRY_STD_MAX: Final[float] = 0.5
 #: Standard deviation of the displacement by a barometer in that time, m: gusts, doors, rotors.
 BAROMETER_STD: Final[float] = 0.3
 #: The vehicle is handed over after displacements have differed for this long, s.
@@ -266,6 +269,8 @@ YAW_MEMORY: Final[float] = 1.0
 PATH_GAP: Final[float] = 0.5
 #: Time between two positions that are kept, s.
 SPACING: Final[float] = 0.1
+#: Acceleration by which the motion during a gap may differ from that of both its ends, m/s^2.
+GAP_ACCELERATION: Final[float] = 3.0
 
 
 class Path:
@@ -280,6 +285,7 @@ class Path:
         self.position: Array | None = None
         """The newest, m, in the frame of the source without its jumps."""
         self._time = -math.inf
+        self._velocity: Array | None = None
         self._shift: Array | float = 0.0
         self._kept: deque[tuple[float, Array]] = deque()
 
@@ -295,16 +301,25 @@ class Path:
         if elapsed > PATH_GAP:
             self._kept.clear()
         shifted = position - self._shift
-        if self.position is not None and velocity is not None and elapsed <= PATH_GAP:
+        if self.position is not None and velocity is not None:
             surprise = shifted - self.position - velocity * elapsed
-            if math.hypot(*surprise.tolist()) > POSITION_JUMP:
+            if math.hypot(*surprise.tolist()) > self._largest_surprise(velocity, elapsed):
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
-        self.position, self._time = shifted, now
+        self.position, self._time, self._velocity = shifted, now, velocity
         if not self._kept or now - self._kept[-1][0] >= SPACING:
             self._kept.append((now, shifted))
             while len(self._kept) > 2 and now - self._kept[1][0] >= DISPLACEMENT_WINDOW:
                 self._kept.popleft()
+
+    def _largest_surprise(self, velocity: Array, elapsed: float) -> float:
+        """Return the largest distance, m, from the expected position that is no jump."""
+        if elapsed <= PATH_GAP:
+            return POSITION_JUMP
+        if self._velocity is None:
+            return math.inf
+        change = math.hypot(*(velocity - self._velocity).tolist())
+        return POSITION_JUMP + elapsed * (change + 0.5 * GAP_ACCELERATION * elapsed)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -363,8 +378,9 @@ class Source:
         """Standard deviation of the position, m."""
 
     def take_velocity(self, velocity: Array, time: float) -> None:
-        """Take a velocity (3,), m/s, at a time, s."""
-        self.velocity, self.velocity_time = velocity, time
+        """Take a velocity (3,), m/s, at a time, s; one that comes late replaces no newer one."""
+        if time >= self.velocity_time:
+            self.velocity, self.velocity_time = velocity, time
 
     def take_position(self, position: ArrayLike | None, time: float, std: float,
                       max_age: float) -> None:
@@ -417,12 +433,12 @@ def find_displacement(odom: Source, autopilot: Source | None, turn: float, heigh
     :param turn: yaw of odom minus that of the autopilot, rad.
     :param height: heights by the barometer.
     """
-    refusal = None
+    refusal, std = None, min(odom.std, ODOMETRY_STD_MAX)
     if autopilot is not None:
         level = difference(odom.path, autopilot.path, -turn, now)[:2]
-        refusal = _too_far(level, math.hypot(odom.std, autopilot.std), 'autopilot')
+        refusal = _too_far(level, math.hypot(std, autopilot.std), 'autopilot')
     up = difference(odom.path, height, 0.0, now)[2:]
-    return refusal or _too_far(up, math.hypot(odom.std, BAROMETER_STD), 'barometer')
+    return refusal or _too_far(up, math.hypot(std, BAROMETER_STD), 'barometer')
 
 
 def _too_far(error: Array, std: float, other: str) -> Refusal | None:

@@ -26,6 +26,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.bridge_state import LOST, NO_AUTOPILOT
 from flock_follower.gate.flight_end import EndParams, FlightEnd, Handover, HOLD
@@ -285,14 +286,18 @@ class Bridge:
         if self.gate.permission.cause is not Cause.SILENT:
             return
         self.ground_station.take_handover(self.gate.permission.reason)
-        if self._blind_action == 'land':
+        # While the mode is unknown the pilot may have taken over: nothing is requested.
+        if self._blind_action == 'land' and self.status(now) is not None:
             self.blind_landing = self.requests.pending if self.requests.landing else (
-                self.requests.begin(commands.land, now))
+                self.requests.begin(commands.land, now, end=Handover(
+                    self.gate.permission.reason, cause=Cause.SILENT)))
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
         """Set height 0: the place of arming, or home if the arming was not observed."""
         heights, flying = self.gate.heights, self.telemetry.is_flying(now)
         armed_now, self._armed = status.armed and self._armed is False, status.armed
+        if flying is False and self.telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
+            flying = True  # it has left the place of arming
         if not status.armed:
             heights.refer(None, now)
         elif armed_now or (not heights.has_reference and flying is False):
@@ -351,10 +356,12 @@ class Bridge:
         Send the final messages.
 
         A vehicle that still flies our setpoints receives a hold command, or the land command again
-        if a landing is pending. The last message is a level setpoint, because autopilots obey it
-        for up to seconds: after that time a braking one would make the vehicle fly backwards.
+        if a landing is pending; none while its mode is unknown. The last message is a level
+        setpoint, because autopilots obey it for up to seconds: after that time a braking one would
+        make the vehicle fly backwards.
         """
-        if self.telemetry.dialect is not None and self.gate.flies:
+        if self.telemetry.dialect is not None and self.gate.flies and (
+                self.status(now) is not None):  # else the pilot may have taken over
             make = commands.land if self.requests.landing else commands.hold
             goal = make(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)

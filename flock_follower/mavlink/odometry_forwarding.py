@@ -32,10 +32,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.gate.velocity_check import plausible_velocity
 from flock_follower.geometry import (
     Array,
-    enu_to_ned,
-    flu_to_frd,
     quaternion_conjugate,
-    quaternion_enu_flu_to_ned_frd,
     quaternion_multiply,
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
@@ -48,6 +45,7 @@ from flock_follower.messages import (
     POSITION_JUMP,
     SANE,
 )
+from flock_follower.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is an error, s.
 FORWARDING_GAP: Final[float] = 0.1

@@ -43,10 +43,11 @@ from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.ranges import first_reason
 
 #: Obstacles to offboard, by the reported landed state.
+UNKNOWN_IF_FLYING: Final[str] = (
+    'the autopilot does not report whether it flies (EXTENDED_SYS_STATE)')
 IN_AIR: Final[dict[bool | None, str]] = {
     True: '', False: 'on the ground: arm, call takeoff, and request offboard in the air',
-    None: 'the autopilot does not report whether it flies (EXTENDED_SYS_STATE), which counts as '
-          'on the ground'}
+    None: f'{UNKNOWN_IF_FLYING}, which counts as on the ground'}
 #: Names of the goals that the permission follows.
 OFFBOARD, LAND = 'offboard', 'land'
 #: PX4 accepts a take-off this much below its minimum height, m.
@@ -234,7 +235,10 @@ class Requests:
         if not status.armed:
             return 'disarmed: arm first'
         # A second climb would begin at the height that the first has reached by now.
-        if telemetry.is_flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
+        flying = telemetry.is_flying(now)
+        if flying is None:
+            return UNKNOWN_IF_FLYING
+        if flying or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
             return 'already in the air'
         if telemetry.altitude(now) is None:
             return 'no LOCAL_POSITION_NED: the height reached would be unknown'

@@ -32,11 +32,8 @@ from flock_follower.gate.permission import MODE_TIMEOUT
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.geometry import (
     Array,
-    frd_to_flu,
-    ned_to_enu,
     normalize_quaternion,
     quaternion_multiply,
-    quaternion_ned_frd_to_enu_flu,
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
 )
@@ -49,6 +46,7 @@ from flock_follower.mavlink.estimator_health import (
     GpsFix,
 )
 from flock_follower.messages import OdometryState
+from flock_follower.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
@@ -60,6 +58,10 @@ LANDED_OLDEST: Final[float] = 3.0
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: The autopilot has rebooted if stamps of two consecutive attitudes go back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
+#: Stamps wrap at 2**32 ms, after 50 days: from at most this long before to as long after it, ms.
+WRAP_MARGIN_MS: Final[int] = 60_000
+#: ``signal_quality`` of a DISTANCE_SENSOR without a valid distance; 0 is unknown.
+_INVALID_DISTANCE: Final[int] = 1
 _FLYING: Final[dict[int, bool]] = {
     mavlink.MAV_LANDED_STATE_ON_GROUND: False, mavlink.MAV_LANDED_STATE_TAKEOFF: False,
     mavlink.MAV_LANDED_STATE_IN_AIR: True, mavlink.MAV_LANDED_STATE_LANDING: True}
@@ -275,6 +277,7 @@ class Telemetry:
         known = self.sensor_altitude
         if message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270 and (
                 message.min_distance <= message.current_distance <= message.max_distance) and (
+                    message.signal_quality != _INVALID_DISTANCE) and (
                     known is None or known.source == 'DISTANCE_SENSOR'):
             self.sensor_altitude = SensorAltitude(
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
@@ -285,7 +288,9 @@ class Telemetry:
         self._boot_time_ms, self._fallen = 0, False
 
     def _notice_reboot(self, stamp: int) -> None:
-        """Detect a reboot by the stamp of an attitude, ms since boot; 0: not set."""
+        """Compare the stamp of an attitude, ms since boot, with the newest; 0: not set."""
+        if self._boot_time_ms >= 2**32 - WRAP_MARGIN_MS and 0 < stamp < WRAP_MARGIN_MS:
+            self._boot_time_ms = stamp
         fallen = 0 < stamp < self._boot_time_ms - REBOOT_STEP_MS
         if fallen and self._fallen:  # a single one may have been delayed
             self.reboots += 1

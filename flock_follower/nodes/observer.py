@@ -36,11 +36,11 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector, POSES
+from flock_follower.checks.dead_segments import dead_segments
 from flock_follower.checks.observations import Machine, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load, LOAD_PERIOD, LoadMeter
 from flock_follower.checks.reach import find_reach, Reach
 from flock_follower.checks.single_camera import alone
-from flock_follower.fast_dds import dead_segments
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.neighbors_file import NeighborConfig

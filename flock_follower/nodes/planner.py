@@ -46,11 +46,11 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.acceleration_messages import from_acceleration
 from flock_follower.bridge_state import ARMED_AT_TOPIC, BridgeState
 from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
 from flock_follower.command_messages import trajectory
 from flock_follower.messages import (
-    from_acceleration,
     from_odometry,
     MOTION_TOPIC,
     OdometryState,
@@ -198,8 +198,9 @@ class Planner(FlockNode):
             self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
 
     def _take_frame(self, message: Header, arrival: int) -> None:
-        if self._loop.take_frame(arrival - self._even_clock.shift,
-                                 stamp_to_nanoseconds(message.stamp)):
+        # Compared with the stamps of neighbors: on the same clock.
+        stamp = self._even_clock.dated(stamp_to_nanoseconds(message.stamp), arrival)
+        if self._loop.take_frame(arrival - self._even_clock.shift, stamp):
             timeout = round(self._settings.current.perception_timeout * 1e9)
             late = self.get_clock().now().nanoseconds - arrival
             # Within the timeout, if the clock was set meanwhile.

@@ -46,7 +46,6 @@ from std_msgs.msg import Header
 from flock_follower.messages import (
     DUPLICATE,
     from_odometry,
-    from_range,
     MOTION_TOPIC,
     NANOSECONDS,
     OdometryState,
@@ -70,7 +69,13 @@ from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
-from flock_follower.pose_messages import child_frame, pose_topic, TRANSFORMS, transforms
+from flock_follower.pose_messages import (
+    child_frame,
+    from_range,
+    pose_topic,
+    TRANSFORMS,
+    transforms,
+)
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at if no odometry comes

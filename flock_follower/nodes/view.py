@@ -73,7 +73,7 @@ from flock_follower.perception.images import compute_in_one_thread, decode_image
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.topic_names import COMPRESSED, COMPRESSED_IMAGES, IMAGE, INFO, RAW_IMAGES
 from flock_follower.view.access import Access, is_loopback, TOKEN_BYTES
-from flock_follower.view.flight import Battery, NodeReport, pose, ShownFlight
+from flock_follower.view.flight import NodeReport, pose, ShownBattery, ShownFlight
 from flock_follower.view.parameter_table import VIEW
 from flock_follower.view.picture import draw_picture
 
@@ -127,7 +127,7 @@ class View(FlockNode):
             self._listen(String, BRIDGE_TOPIC,
                          lambda m: take.take_bridge(m.data, time.monotonic()), LATCHED_QOS),
             self._listen(Range, 'planner/distance', self._distances.append, best_effort(20)),
-            self._listen(BatteryState, 'mavlink/battery', lambda m: take.take_battery(Battery(
+            self._listen(BatteryState, 'mavlink/battery', lambda m: take.take_battery(ShownBattery(
                 time.monotonic(), m.percentage, m.voltage)), best_effort())]
         self._open: list[Subscription] = []
         """The subscriptions that only an open page needs."""

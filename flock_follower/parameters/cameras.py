@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any, Final, NamedTuple
 
-from flock_follower.parameters.spec import NAMES, Spec
+from flock_follower.parameters.spec import CAMERA_NAMES, NAMES, Spec
 from flock_follower.ranges import MAX_OFFSET, Range
 
 #: Default position of a camera on the body, m: in front of the middle of the vehicle.
@@ -34,9 +34,7 @@ DEFAULT_POSITION: Final = (0.10, 0.0, 0.0)
 DEFAULT_RPY: Final = (0.0, 0.0, 0.0)
 
 CAMERA_SPECS = [
-    Spec(NAMES, [''],
-         'names of several cameras, each with parameters camera.NAME...; empty: a single camera, '
-         'with camera_rpy'),
+    CAMERA_NAMES,
     Spec('camera.NAME.image', 'NAME/image_raw',
          "topic of the camera's images; of compressed images without /compressed"),
     Spec('camera.NAME.camera_info', 'NAME/camera_info', "topic of the camera's calibration"),

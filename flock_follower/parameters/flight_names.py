@@ -16,7 +16,6 @@
 The names of the parameters of relative_pose, planner and mavlink_bridge; test_tables holds them.
 
 A node refuses an unknown name in a section that all three read, and loads no table but its own.
-Those of cameras, ``camera.NAME...``, are in ``cameras.CAMERA_SPECS``.
 """
 
 from __future__ import annotations
@@ -26,7 +25,10 @@ from typing import Final
 FLIGHT_NAMES: Final = frozenset({
     'a_max', 'acceleration', 'acceleration_time', 'altitude_max', 'altitude_min', 'altitude_mode',
     'altitude_offset', 'announce_as_gcs', 'autopilot', 'b', 'battery_action', 'battery_low',
-    'beta', 'blind_action', 'camera_position', 'camera_rpy', 'cameras', 'climb_rate_max',
+    'beta', 'blind_action', 'camera.NAME.camera_info', 'camera.NAME.image',
+    'camera.NAME.position', 'camera.NAME.readout_time', 'camera.NAME.rectified',
+    'camera.NAME.rpy', 'camera.NAME.time_offset', 'camera_position', 'camera_rpy', 'cameras',
+    'climb_rate_max',
     'coast_timeout', 'connection', 'd0', 'd1', 'engage_timeout', 'forward_odometry',
     'global_origin', 'guard', 'height_max', 'height_min', 'image_transport', 'K',
     'leader_acceleration_max', 'leader_lost_action', 'leader_speed_max', 'link_timeout', 'm',

@@ -33,9 +33,8 @@ from typing import Any, Final
 import yaml
 
 from flock_follower.files import read_text
-from flock_follower.parameters.cameras import CAMERA_SPECS
 from flock_follower.parameters.flight_names import FLIGHT_NAMES
-from flock_follower.parameters.spec import expanded, refuse_unknown, Spec
+from flock_follower.parameters.spec import expanded, expanded_names, refuse_unknown, Spec
 
 #: Key of a node's diagnostics: its parameter files.
 PARAMETER_FILES: Final = 'parameter_files'
@@ -62,7 +61,7 @@ def names_for_any_node(paths: Sequence[str | Path], node: str, specs: Sequence[S
         with naming(path):
             for section, values in read_sections(read(path)):
                 if last(section) in _ANY_NAME and means(section, node):
-                    known = FLIGHT_NAMES | names(CAMERA_SPECS, values) | names(specs, values)
+                    known = expanded_names(FLIGHT_NAMES, values) | names(specs, values)
                     refuse_unknown(values, known, section)
                     found |= values.keys() & known
     return found

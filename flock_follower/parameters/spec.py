@@ -135,6 +135,12 @@ class Spec:
         return self.range.holds(value)
 
 
+CAMERA_NAMES = Spec(
+    NAMES, [''],
+    'names of several cameras, each with parameters camera.NAME...; empty: a single camera, with '
+    'camera_rpy')
+
+
 def specs_of(params: Checked, prefix: str = '') -> list[Spec]:
     """
     Return a parameter for each declared field of ``params`` and of its parts.
@@ -192,17 +198,29 @@ def expanded(specs: Sequence[Spec], values: Mapping[str, Any]) -> list[Spec]:
 
     :raises ValueError: if the list of names, among the values, is wrong.
     """
-    listed = next((spec for spec in specs if spec.name == NAMES), None)
-    if listed is None:
+    if CAMERA_NAMES not in specs:
         return list(specs)
-    value: Any = listed.check(values.get(NAMES, listed.default))
+    cameras = _listed_cameras(values)
+    return [spec if name is None else spec.named(name) for spec in specs
+            for name in (cameras if EACH in spec.name else [None])]
+
+
+def expanded_names(names: Iterable[str], values: Mapping[str, Any]) -> set[str]:
+    """Return names of parameters as :func:`expanded` does; ValueError likewise."""
+    cameras = _listed_cameras(values)
+    return {name.replace(EACH, camera) for name in names
+            for camera in (cameras if EACH in name else [EACH])}
+
+
+def _listed_cameras(values: Mapping[str, Any]) -> list[str]:
+    """Return the names of several cameras, [] of one; ValueError if the list is wrong."""
+    value: Any = CAMERA_NAMES.check(values.get(NAMES, CAMERA_NAMES.default))
     names = [name for name in value if name]
     for name in names:
         if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or names.count(name) > 1:
             raise ValueError(f'{NAMES} = {value}: {name!r} must be a letter, then letters, digits '
                              'and _, different from the others')
-    return [spec if name is None else spec.named(name) for spec in specs
-            for name in (names if EACH in spec.name else [None])]
+    return names
 
 
 def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> None:

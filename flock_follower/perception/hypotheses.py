@@ -30,6 +30,13 @@ is, nor ever beside it           of the primary track ``leader_speed_max`` reach
 out of view                      after PATIENCE, if it has moved; never, if it stands still
 ===============================  ================================================================
 
+Poses by another detector have no id that is printed elsewhere, but single ones are outliers:
+
+- A primary track with fewer than three measurements may have begun with an outlier: a candidate
+  with three since then takes its place.
+- A candidate that is not confirmed gets no measurement near the primary track: else the place of
+  an outlier ahead of a neighbor takes the measurements of that neighbor as it passes.
+
 Positions are in the smooth frame of ``OdometryBuffer``.
 """
 
@@ -45,7 +52,7 @@ from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutc
 from flock_follower.perception.neighbor_motion import FilterParams
 
 #: A measurement nearer than this to a candidate's expected place is of that candidate, m.
-SAME = 0.3
+SAME_PLACE = 0.3
 #: Tolerance of the distance of a restart, m: errors of both places.
 RESTART_TOLERANCE = 0.3
 #: A candidate has moved if it covers this distance, m, within WINDOW.
@@ -53,7 +60,7 @@ MOVED = 0.5
 #: Time in which a moving candidate covers MOVED, s.
 WINDOW = 5.0
 #: A candidate with fewer measurements may be a false detection.
-CONFIRMED = 3
+N_CONFIRMED = 3
 #: The primary track must be unseen for this long, s, before a candidate can replace it.
 PATIENCE = 10.0
 #: A candidate at rest is kept for this long, s, after its last measurement.
@@ -100,8 +107,8 @@ class Candidate:
 
     @property
     def confirmed(self) -> bool:
-        """Return whether it has enough measurements, so that it is no false detection."""
-        return self.measured >= CONFIRMED
+        """Return whether it is more than a false detection."""
+        return self.measured >= N_CONFIRMED
 
     @property
     def seen(self) -> float:
@@ -133,10 +140,14 @@ class Taken(NamedTuple):
 
 
 class Hypotheses:
-    """The primary track of one neighbor, and the candidates with the same marker."""
+    """
+    The primary track of one neighbor, and the candidates with the same marker.
 
-    def __init__(self, params: FilterParams) -> None:
-        self.params = params
+    :param marked: whether the neighbor carries markers; else another detector measures its poses.
+    """
+
+    def __init__(self, params: FilterParams, marked: bool = True) -> None:
+        self.params, self._marked = params, marked
         self.primary = NeighborFilter(params)
         self.reset()
 
@@ -144,6 +155,7 @@ class Hypotheses:
         """Forget all of them."""
         self.primary.reset()
         self._motion = _Motion()
+        self._measured = 0  # measurements of the primary track since it started
         self._lost: Array | None = None
         """Position (3,), m, of the primary track before its restart; None without a restart."""
         self.candidates: list[Candidate] = []
@@ -157,10 +169,16 @@ class Hypotheses:
         """Return the candidate that a measurement at a place (3,), m, belongs to, or None."""
         if not self.candidates:
             return None
-        nearest = min(self.candidates, key=lambda each: each.distance(time, place))
+        nearest = self._find_nearest(time, place)
         expected = self.primary.place(time)
-        least = SAME if expected is None else min(SAME, math.dist(place, expected.translation))
+        least = SAME_PLACE if expected is None else min(
+            SAME_PLACE, math.dist(place, expected.translation))
+        if not self._marked and least < SAME_PLACE and not nearest.confirmed:
+            return None
         return nearest if nearest.distance(time, place) < least else None
+
+    def _find_nearest(self, time: float, place: Array) -> Candidate:
+        return min(self.candidates, key=lambda each: each.distance(time, place))
 
     def take(self, time: float, measured: Transform, reference: Array, covariance: Array,
              another: bool = False, alike: Array | None = None) -> Taken:
@@ -181,7 +199,7 @@ class Hypotheses:
                 *arguments, alike)
             if outcome is not UpdateOutcome.OUTLIER:
                 return Taken(outcome)
-            candidate = self._add(time, measured.translation)
+            candidate = self._choose_candidate(time, measured.translation)
         if time <= candidate.seen:
             return Taken(UpdateOutcome.LATE, candidate)
         candidate.take(*arguments)
@@ -192,6 +210,14 @@ class Hypotheses:
             self._exchange(candidate)
             return Taken(UpdateOutcome.STARTED)
         return Taken(UpdateOutcome.OUTLIER, candidate)
+
+    def _choose_candidate(self, time: float, place: Array) -> Candidate:
+        """Return the candidate of a measurement (3,), m, that the primary track refused."""
+        if not self._marked and self.candidates:
+            nearest = self._find_nearest(time, place)
+            if nearest.distance(time, place) < SAME_PLACE:
+                return nearest
+        return self._add(time, place)
 
     def _update_primary(self, time: float, measured: Transform, reference: Array,
                         covariance: Array, alike: Array | None) -> UpdateOutcome:
@@ -205,7 +231,9 @@ class Hypotheses:
                                       reach if surprised else 0.0, alike)
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
+            self._measured = 0
         if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
+            self._measured += 1
             self._motion.take(time, measured.translation)
             for each in self.candidates:
                 each.alone = 0
@@ -220,6 +248,8 @@ class Hypotheses:
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
         """Return whether a candidate replaces the primary track; see the module."""
         moved, last = candidate.motion.moved, self.primary.newest
+        if not self._marked and self._measured < N_CONFIRMED <= candidate.alone:
+            return True
         if candidate.measured < self.params.max_rejections:
             return False
         if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
@@ -245,6 +275,7 @@ class Hypotheses:
         self.primary.reset()
         self.primary.newest = candidate.track.newest
         self._motion, candidate.motion = candidate.motion, self._motion
+        self._measured = candidate.measured
         candidate.track, candidate.alone = before, 0
         if not candidate.beside:
             self.candidates.remove(candidate)

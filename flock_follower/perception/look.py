@@ -15,11 +15,12 @@
 """
 One image in perception: its expected content, and the content that was found.
 
-``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
-shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbor
-counts as seen when the row of its markers' middle was exposed. The rows above and below see it
-earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners to
-where they were with the middle row, by the relative motion, which comes mostly from the own rates.
+``CameraMotion`` is the camera's pose and motion at the time of an image, or of one of its rows. A
+rolling shutter exposes row r of an image of height h r / h * readout_time after the first row. A
+neighbor counts as seen when the row of its markers' middle was exposed. The rows above and below
+see it earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners
+to where they were with the middle row, by the relative motion, which comes mostly from the own
+rates.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ MAX_TURN = 0.3  # rad: a fit whose attitude differs by more from the detection's
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
-class View(NamedTuple):
+class CameraMotion(NamedTuple):
     """
     The ego state at the exposure, and the camera's pose in ``OdometryBuffer``'s smooth frame.
 
@@ -67,7 +68,7 @@ class View(NamedTuple):
     T_smooth_camera: Transform
 
     @classmethod
-    def of(cls, own: OdometrySample, T_body_camera: Transform) -> View:
+    def of(cls, own: OdometrySample, T_body_camera: Transform) -> CameraMotion:
         """Return the view of a camera mounted at ``T_body_camera``."""
         body = own.smooth_pose
         return cls(own, body.rotation, body @ T_body_camera)
@@ -248,7 +249,7 @@ class Look:
     """
     camera: MountedCamera
     model: CameraModel
-    view: View
+    view: CameraMotion
     near: Sequence[str]
     anywhere: Sequence[str]
     expected: dict[str, PosePrior]

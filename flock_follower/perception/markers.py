@@ -52,12 +52,6 @@ class Detections(NamedTuple):
     corners: Array
 
 
-def concatenate_detections(*found: Detections) -> Detections:
-    """Return all the markers of several searches."""
-    return Detections(np.concatenate([each.ids for each in found]),
-                      np.concatenate([each.corners for each in found]))
-
-
 NO_DETECTIONS = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 
 

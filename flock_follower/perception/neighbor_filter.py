@@ -259,12 +259,8 @@ class NeighborFilter:
         if self._is_contradicted(stamp):
             return self._start(stamp, T_odom_body, reference, covariance, whole, expected)
         self._learn(stamp - now.stamp, innovation, nominal)
-        # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - gain.T.dot(jacobian)
-        corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
-        if shared is not None:
-            common = remain.dot(shared).dot(gain)
-            corrected -= common + common.T
+        corrected = _corrected_covariance(prior, remain, gain, noise, shared)
         self._alike.take(remain, gain.T, root)
         self._predicted, self._line = None, _BODY_CENTER
         self.newest = expected.corrected(gain.T.dot(innovation), corrected)
@@ -400,3 +396,19 @@ class NeighborFilter:
         self.newest = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                acceleration, full)
         return UpdateOutcome.STARTED
+
+
+def _corrected_covariance(prior: Array, remain: Array, gain: Array, noise: Array,
+                          shared: Array | None) -> Array:
+    """
+    Return the covariance after an update: symmetric and positive whatever the rounding (Joseph).
+
+    :param remain: 1 - K H. :param gain: the transpose of K.
+    :param shared: covariance of state and measurement before the update, if any.
+    """
+    corrected: Array
+    corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
+    if shared is not None:
+        common = remain.dot(shared).dot(gain)
+        corrected -= common + common.T
+    return corrected

@@ -33,8 +33,7 @@ import numpy as np
 from flock_follower.geometry import Array, rotation_vector_to_matrix, rpy_from_matrix, Transform
 from flock_follower.neighbors_file import Marker
 from flock_follower.perception.images import gray_levels, GrayImage
-from flock_follower.perception.markers import concatenate_detections, Detections, marker_code
-from flock_follower.perception.search import everywhere
+from flock_follower.perception.markers import marker_code
 
 #: Cells of the black border that are told apart; the first is that of our prints.
 BORDER_WIDTHS = (1, 2, 3)
@@ -115,12 +114,6 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
     return None if cells == BORDER_WIDTHS[0] else Fault(
         WRONG_BORDER, f'marker {marker.marker_id} has a black border of {cells} cells',
         f'print it with a border of one cell: marker --dictionary {dictionary}')
-
-
-def with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
-    """Return the markers with a border of two or three cells, and some with one cell."""
-    return concatenate_detections(*(
-        everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
 
 
 def border_sought(rounds: int) -> int:

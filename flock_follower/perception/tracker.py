@@ -50,6 +50,7 @@ from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import (
+    CameraMotion,
     DIRECTION_ERROR,
     Look,
     MAX_TURN,
@@ -58,7 +59,6 @@ from flock_follower.perception.look import (
     row_delay,
     Sighting,
     straightened,
-    View,
 )
 from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
@@ -104,7 +104,7 @@ class _Placed(NamedTuple):
     ``covariance`` (6, 6) and ``alike`` are as ``NeighborFilter.update`` takes them.
     """
 
-    view: View
+    view: CameraMotion
     exposed: float
     time: float
     T_smooth_body: Transform
@@ -137,7 +137,8 @@ class Tracker:
         marked = [n for n in config.neighbors if n.markers]
         self._targets = {n.name: target(n, config.dictionary) for n in marked}
         self._side = {n.name: max(m.side_length for m in n.markers) for n in marked}
-        self._hypotheses = {n.name: Hypotheses(params) for n in config.neighbors}
+        self._hypotheses = {
+            n.name: Hypotheses(params, n.source is None) for n in config.neighbors}
         self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._marked = {n.name: self._filters[n.name] for n in marked}
         self._sources = {n.name: MountedCamera(
@@ -299,17 +300,17 @@ class Tracker:
                 self._time(name, camera, exposed)))
             for name in {*sought.near, *sought.anywhere}})
 
-    def _prior(self, view: View, estimate: Estimate | None) -> PosePrior:
+    def _prior(self, view: CameraMotion, estimate: Estimate | None) -> PosePrior:
         """Return the expected pose; without odometry, the upward direction is unknown."""
         prior = view.prior(estimate)
         return prior._replace(up=None) if self.alone else prior
 
-    def _view(self, camera: MountedCamera, exposed: float) -> View | Missing:
+    def _view(self, camera: MountedCamera, exposed: float) -> CameraMotion | Missing:
         """Return the view of a camera at a time by its clock, s."""
         own = self._odometry.at(exposed + camera.time_offset.applied)
         if isinstance(own, Missing):
             return own
-        return View.of(self._odometry.steadied(own), camera.T_body_camera)
+        return CameraMotion.of(self._odometry.steadied(own), camera.T_body_camera)
 
     def _time(self, name: str, camera: MountedCamera, exposed: float) -> float:
         """Return the time of a neighbor's filter, s, of an exposure by the camera's clock, s."""
@@ -431,7 +432,7 @@ class Tracker:
         """Return a measurement in the smooth frame; None without odometry of its exposure."""
         camera, name = look.camera, measurement.name
         pose, reference = measurement.T_camera_body, measurement.reference
-        view: View | Missing = look.view
+        view: CameraMotion | Missing = look.view
         exposed = look.stamp
         if camera.readout_time:
             exposed += row_delay(look.model, camera.readout_time, pose.apply(reference))

@@ -61,22 +61,12 @@ import numpy as np
 
 from flock_follower.geometry import GRAVITY, SHORTEST, wrap_angle
 from flock_follower.messages import SANE
+from flock_follower.planner.bound_keeping import Bound, COHESION, FENCE, SEPARATION, SIGHT
 from flock_follower.planner.inputs import (
     Neighbor,
     OwnState,
     predict,
     Prediction,
-)
-from flock_follower.planner.limits import (
-    Bound,
-    COHESION,
-    difference,
-    FENCE,
-    horizontal,
-    opposite,
-    scalar_product,
-    SEPARATION,
-    SIGHT,
 )
 from flock_follower.planner.params import (
     Edges,
@@ -85,7 +75,8 @@ from flock_follower.planner.params import (
     Member,
     PlannerParams,
 )
-from flock_follower.planner.sight import IMAGE_MARGIN, vertical, View
+from flock_follower.planner.sight import FieldsOfView, IMAGE_MARGIN, vertical
+from flock_follower.planner.vectors import difference, horizontal, opposite, scalar_product
 from flock_follower.planner.vertical_yaw import OVERHEAD_DISTANCE
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
@@ -218,7 +209,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
 
 
 def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Prediction, yaw: float,
-                 view: View, params: PlannerParams) -> list[Bound]:
+                 view: FieldsOfView, params: PlannerParams) -> list[Bound]:
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
 

@@ -32,6 +32,14 @@ import numpy as np
 
 from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
+from flock_follower.planner.bound_keeping import (
+    Bound,
+    COHESION,
+    FENCE,
+    keep_bounds,
+    limit_horizontal,
+    SEPARATION,
+)
 from flock_follower.planner.bounds import (
     clear_of_sphere,
     DOWNWASH_SHARE,
@@ -49,23 +57,13 @@ from flock_follower.planner.inputs import (
     predict,
     Prediction,
 )
-from flock_follower.planner.limits import (
-    Bound,
-    COHESION,
-    difference,
-    FENCE,
-    keep_bounds,
-    limit_command,
-    limit_horizontal,
-    LimitedCommand,
-    scalar_product,
-    SEPARATION,
-)
+from flock_follower.planner.limits import limit_command, LimitedCommand
 from flock_follower.planner.memory import Loss, max_age, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.scene import RECEIVED_SIGMAS, Scene, silent
-from flock_follower.planner.sight import View
+from flock_follower.planner.sight import FieldsOfView
+from flock_follower.planner.vectors import difference, scalar_product
 
 HORIZONTAL_AXES = np.array([1.0, 1.0, 0.0])  # factors of x, y, z
 
@@ -247,7 +245,7 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
 
 
 def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, scene: Scene,
-              velocity: Array, view: View, params: PlannerParams) -> LimitedCommand:
+              velocity: Array, view: FieldsOfView, params: PlannerParams) -> LimitedCommand:
     """
     Return the nearest command within all limits and bounds.
 
@@ -291,7 +289,7 @@ def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> flo
     return min(max(slower, 0.0), DRAG_SHARE * params.v_max)
 
 
-def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
+def _bounds(memory: Memory, scene: Scene, velocity: Array, view: FieldsOfView,
             params: PlannerParams) -> list[Bound]:
     """
     Return all bounds in their order.
@@ -372,7 +370,7 @@ def _pass_beside(away: Sequence[float]) -> list[float]:
     return [math.sqrt(0.5) * (x - y), math.sqrt(0.5) * (y + x), 0.0]
 
 
-def _sight_bounds(memory: Memory, scene: Scene, velocity: Sequence[float], view: View,
+def _sight_bounds(memory: Memory, scene: Scene, velocity: Sequence[float], view: FieldsOfView,
                   params: PlannerParams) -> list[Bound]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
     me, faced = scene.me, scene.neighbors.faced

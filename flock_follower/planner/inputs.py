@@ -115,10 +115,12 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
     for name, covariance, most in (
             ('position', n.position_covariance, params.max_position_std),
             ('velocity', n.velocity_covariance, params.max_velocity_std)):
-        (xx, _, _), (_, yy, _), (_, _, zz) = covariance.tolist()
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = covariance.tolist()
         variance = xx + yy + zz
         if not 0.0 <= variance <= most ** 2:  # NaN is uncertain; some sources send -1 for unknown
             return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
+        if not all(abs(both) <= variance for both in (xy + yx, xz + zx, yz + zy)):
+            return Rejection('too uncertain', f'invalid covariance of its {name}')
     return None
 
 

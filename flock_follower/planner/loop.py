@@ -22,21 +22,17 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from flock_follower.acceleration_messages import AccelerationState, with_acceleration
 from flock_follower.bridge_state import ACTIVE, BridgeState, effective_state, parse, TAKEN_OVER
 from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.messages import (
-    AccelerationState,
-    OdometryChoice,
-    OdometryState,
-    RELATIVE,
-    with_acceleration,
-)
+from flock_follower.messages import OdometryState, RELATIVE
+from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import odometry_fault, State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, View
+from flock_follower.planner.sight import FieldOfView, FieldsOfView
 from flock_follower.planner.step import Decision, step
 
 #: Largest standard deviation of a neighbor's yaw that is used, rad.
@@ -62,7 +58,7 @@ class PlannerLoop:
     def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
-        self.view: View = ()
+        self.view: FieldsOfView = ()
         """Fields of view of the cameras; () if unknown."""
         self._fields: dict[str, FieldOfView] = {}
         self.ground: float | None = None

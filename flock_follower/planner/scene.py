@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
+from flock_follower.planner.bound_keeping import REASONS
 from flock_follower.planner.inputs import (
     find_newest,
     Neighbor,
@@ -40,7 +41,6 @@ from flock_follower.planner.inputs import (
     Rejection,
     TRUSTED_TIME,
 )
-from flock_follower.planner.limits import REASONS
 from flock_follower.planner.memory import by_name, Loss, Memory, update_motions
 from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import (

@@ -33,6 +33,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner import relative
+from flock_follower.planner.bound_keeping import SEPARATION
 from flock_follower.planner.guard import (
     climb_range,
     constrain,
@@ -41,19 +42,18 @@ from flock_follower.planner.guard import (
     retreat,
 )
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
-from flock_follower.planner.limits import SEPARATION
 from flock_follower.planner.memory import ingest, Memory, update_pending
 from flock_follower.planner.modes import blind, next_state, odometry_delay, odometry_fault, State
 from flock_follower.planner.neighborhood import last_known, nominal, reports
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.scene import Decision, expected_now, Scene, survey
-from flock_follower.planner.sight import Occlusion, occlusion, View
+from flock_follower.planner.sight import FieldsOfView, Occlusion, occlusion
 from flock_follower.planner.vertical_yaw import Altitude, face_yaw, search_yaw, turn_rate
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          estimates: Iterable[Neighbor], params: PlannerParams, looked: float | None = None,
-         waiting: str = '', view: View = (), ground: float | None = None,
+         waiting: str = '', view: FieldsOfView = (), ground: float | None = None,
          frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
     Return the memory for the next step, and the decision for the time ``now``, s.
@@ -113,7 +113,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
-          blinded: str, waiting: str, view: View, frames: Sequence[float]
+          blinded: str, waiting: str, view: FieldsOfView, frames: Sequence[float]
           ) -> tuple[Memory, State, str, float | None]:
     """
     Return memory, state, the reason for the state, and the stamp of the newest estimate, s.
@@ -141,7 +141,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
 
 
 def _judge_occlusion(memory: Memory, now: float, frames: Sequence[float],
-                     view: View) -> Occlusion | None:
+                     view: FieldsOfView) -> Occlusion | None:
     """Return the occlusion of the faced neighbor, or None."""
     if memory.own is None or memory.followed is None:
         return None
@@ -166,7 +166,8 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,
     me, coming = me._replace(velocity=me.velocity + flown), float(memory.pending[2])
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
-    altitude = memory.altitude or Altitude.begin(me, None if jumped else ground, params)
+    altitude = Altitude.begin(me, None if jumped else ground, params) if (
+        memory.altitude is None) else memory.altitude.with_limits_of(params)
     level = neighbors.level
     if level is None and missed is not None and not scene.blinded:
         level = expected_now(missed, memory, me.stamp, params)

@@ -65,6 +65,10 @@ class Altitude(NamedTuple):
     """The altitude that the command leads to, m; NaN while neighbors limit the climb."""
     neighbor_climb: float | None = None
     """Vertical velocity of the neighbor that is followed, m/s; None without one."""
+    ground: float | None = None
+    """Height at which the vehicle was armed, m; None if unknown."""
+    limits: tuple[float, float] | None = None
+    """``altitude_min`` and ``altitude_max`` that the bounds are of, m."""
 
     @classmethod
     def begin(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
@@ -73,11 +77,22 @@ class Altitude(NamedTuple):
 
         :param ground: height at which the vehicle was armed, m; None if unknown.
         """
-        z = float(me.position[2])
+        z, limits = float(me.position[2]), (params.altitude_min, params.altitude_max)
         if ground is None:
-            return cls(z, z, z + params.altitude_max)
-        return cls(z, min(ground + params.altitude_min + ALTITUDE_MARGIN, z),
-                   max(ground + params.altitude_max - ALTITUDE_MARGIN, z))
+            return cls(z, z, max(z + limits[1], z), ground=ground, limits=limits)
+        low, high = _within_limits(ground, params)
+        return cls(z, min(low, z), max(high, z), ground=ground, limits=limits)
+
+    def with_limits_of(self, params: PlannerParams) -> Altitude:
+        """Return it with the bounds of parameters that have changed in flight."""
+        limits = params.altitude_min, params.altitude_max
+        if self.limits is None or limits == self.limits:
+            return self
+        if self.ground is None:
+            return self._replace(limits=limits, highest=self.lowest + max(limits[1], 0.0))
+        (low, high), (least, most) = _within_limits(self.ground, params), self.limits
+        return self._replace(limits=limits, lowest=self.lowest if limits[0] == least else low,
+                             highest=self.highest if limits[1] == most else high)
 
     def follow(self, leader: Neighbor | None, params: PlannerParams,
                elapsed: float) -> Altitude:
@@ -137,6 +152,12 @@ class Altitude(NamedTuple):
             low = max(min(least, up), -down) - rate - coming
             vertical = max(vertical, min(low / params.guarding.T_g, strongest))
         return self._replace(commanded=goal if clear == speed else math.nan), vertical
+
+
+def _within_limits(ground: float, params: PlannerParams) -> tuple[float, float]:
+    """Return the lowest and the highest altitude, m, by the parameters."""
+    return (ground + params.altitude_min + ALTITUDE_MARGIN,
+            ground + params.altitude_max - ALTITUDE_MARGIN)
 
 
 def _stopped_within(gap: float, gain: float) -> float:

@@ -31,7 +31,8 @@ import numpy as np
 from flock_follower.bridge_state import BridgeState, effective_state, parse, SILENCE_MAX
 from flock_follower.command_messages import Command
 from flock_follower.geometry import quaternion_to_matrix, Transform
-from flock_follower.messages import OdometryChoice, OdometryState
+from flock_follower.messages import OdometryState
+from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.view.scene import (
     band,
     draw,
@@ -78,7 +79,7 @@ class NodeReport(NamedTuple):
     values: Mapping[str, str]
 
 
-class Battery(NamedTuple):
+class ShownBattery(NamedTuple):
     """Share of the charge, and V; NaN if unknown."""
 
     time: float
@@ -98,7 +99,7 @@ class ShownFlight:
         self._state = ''
         self._bridge: BridgeState | None = None
         self._reports: dict[str, NodeReport] = {}
-        self._battery = Battery(-math.inf, math.nan, math.nan)
+        self._battery = ShownBattery(-math.inf, math.nan, math.nan)
         self._distance: tuple[str, float] = '', math.nan
         self._distances: deque[tuple[float, float]] = deque()
         self._tracks: dict[str, deque[tuple[float, float, float]]] = {}
@@ -151,7 +152,7 @@ class ShownFlight:
         if node in LIMITS:
             self.note(node, report.time)
 
-    def take_battery(self, battery: Battery) -> None:
+    def take_battery(self, battery: ShownBattery) -> None:
         """Take the state of the battery."""
         self._battery = battery
         self.note('battery', battery.time)

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, matrix_to_quaternion
 from flock_follower.messages import OdometryState
-from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
+from flock_follower.planner.bound_keeping import COHESION, REASONS, SEPARATION
 
 #: Kinds of shapes.
 BOX, ARROW, LINE, ELLIPSOID, TEXT = 'box', 'arrow', 'line', 'ellipsoid', 'text'

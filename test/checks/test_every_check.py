@@ -32,13 +32,13 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.check import main
 from flock_follower.checks.collector import Collector
+from flock_follower.checks.dead_segments import dead_segments
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
 from flock_follower.checks.observations import NodeStatus, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.fast_dds import dead_segments
 from flock_follower.geometry import (
     quaternion_from_rpy,
     quaternion_multiply,

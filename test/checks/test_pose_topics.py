@@ -26,12 +26,13 @@ from flock_follower.bags.message_types import empty
 from flock_follower.checks.collector import Collector, POSES
 from flock_follower.checks.findings import ERROR, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
-from flock_follower.checks.pose_topics import check_poses
+from flock_follower.checks.pose_topics import check_poses, PREDICT_TIMEOUT
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
 from flock_follower.messages import odometry, to_nanoseconds
 from flock_follower.neighbors_file import parse
-from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME
+from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME, UNPLACED
 from flock_follower.perception.tracker import camera_mounting
+from flock_follower.planner.params import PlannerParams
 from flock_follower.pose_messages import POSE, pose_with_covariance
 from flock_follower.topic_names import names_there
 
@@ -47,28 +48,35 @@ Change = Callable[[Any, int], Any]
 
 
 def levels(change: Change = lambda message, k: message, latency: float = 0.03,
-           pose: Transform = IN_CAMERA, frames_topic: str = '') -> tuple[Observations,
-                                                                         dict[str, str]]:
-    """Return the observations of a hovering pair, and the level of each row."""
+           pose: Transform = IN_CAMERA, frames_topic: str = '', max_wait: float = 0.35,
+           gap: range = range(0)) -> tuple[Observations, dict[str, str]]:
+    """
+    Return the observations of a hovering pair, and the level of each row.
+
+    :param gap: numbers of the messages of odometry that are missing.
+    """
     random = np.random.default_rng(2)
     seen = Observations(live=False, names=names_there('', {}), topics={
         '/odom': TopicSeen(), '/poses': TopicSeen([TopicEnd('', POSE)])},
-        parameters={'relative_pose': {'camera_position': [0.1, 0.0, 0.0]}})
+        parameters={'relative_pose': {'camera_position': [0.1, 0.0, 0.0],
+                                      'max_wait': max_wait}})
     collector = Collector(seen, 6.0)
     info = empty('sensor_msgs/msg/CameraInfo')
     info.header.frame_id = 'optical'
     seen.calibration = info
     for k in range(300):
         stamp = START + k / 50.0
-        collector.take('odom', '/odom', odometry(
-            empty, to_nanoseconds(stamp), 'odom', 'base_link', [0.0, 0.0, 1.0],
-            [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0]), stamp)
+        if k not in gap:
+            collector.take('odom', '/odom', odometry(
+                empty, to_nanoseconds(stamp), 'odom', 'base_link', [0.0, 0.0, 1.0],
+                [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0]), stamp)
         if k % 5 == 0:
             error: Array = random.normal(0.0, 0.03, 3)
             message = change(pose_with_covariance(
                 empty, to_nanoseconds(stamp), 'optical',
                 Transform(pose.rotation, pose.translation + error), COVARIANCE), k // 5)
-            collector.take(POSES, '/poses', message, stamp + latency)
+            if message is not None:
+                collector.take(POSES, '/poses', message, stamp + latency)
     collector.finish(parse({'neighbors': [{'name': 'leader', 'pose_topic': 'poses'}],
                             **({'frames_topic': frames_topic} if frames_topic else {})}))
     return seen, {finding.what.removeprefix('poses of leader').strip(): finding.level
@@ -79,6 +87,11 @@ def outlier(message: Any, k: int) -> Any:
     if k % 20 == 7:
         message.pose.pose.position.z += 1.0
     return message
+
+
+def with_bursts_missing(message: Any, k: int) -> Any:
+    """Lack five poses of each twenty."""
+    return None if k % 20 < 5 else message
 
 
 def in_frame(message: Any, k: int) -> Any:
@@ -95,13 +108,15 @@ def without_attitude(message: Any, k: int) -> Any:
 
 def test_poses_that_are_well_have_no_fault() -> None:
     seen, rows = levels()
-    assert rows == {'': OK, 'rate': OK, 'latency': OK, 'used': OK, 'outliers': OK, 'axes': OK}
+    assert rows == {'': OK, 'rate': OK, 'latency': OK, 'gaps': OK, 'used': OK,
+                    'outliers': OK, 'axes': OK}
     assert seen.sources['leader'].taken == 60
 
 
 @pytest.mark.parametrize(('options', 'faults'), [
     ({'latency': 0.15}, {'latency': WARNING}),
-    ({'latency': 0.5}, {'latency': ERROR}),
+    ({'latency': 0.5}, {'latency': ERROR, 'gaps': WARNING}),
+    ({'change': with_bursts_missing}, {'gaps': WARNING}),
     ({'change': outlier}, {'outliers': WARNING}),
     ({'change': outlier, 'latency': 0.15}, {'outliers': WARNING, 'latency': WARNING}),
     ({'change': in_frame}, {'used': ERROR, 'outliers': UNMEASURED, 'axes': UNMEASURED}),
@@ -114,6 +129,19 @@ def test_each_fault_of_poses_has_its_row(options: dict[str, Any], faults: dict[s
     assert {what: level for what, level in rows.items() if level != OK} == faults
 
 
+def test_gaps_are_those_of_the_planner() -> None:
+    assert PlannerParams.predict_timeout == PREDICT_TIMEOUT
+
+
 def test_refused_poses_are_counted_by_their_reasons() -> None:
     assert levels(in_frame)[0].sources['leader'].refused == {UNKNOWN_FRAME: 60}
     assert levels(without_attitude)[0].sources['leader'].refused == {NO_ATTITUDE: 6}
+
+
+def test_a_pose_waits_for_odometry_as_long_as_in_the_node() -> None:
+    """Odometry lacks 0.2 s: the pose in it waits for 0.2 s, or is refused before."""
+    gap = range(99, 109)
+    patient, hasty = (levels(max_wait=max_wait, gap=gap)[0].sources['leader']
+                      for max_wait in (0.35, 0.05))
+    assert patient.used == patient.taken and not patient.refused
+    assert hasty.refused[UNPLACED] and hasty.used + hasty.refused.total() == hasty.taken

@@ -207,6 +207,64 @@ def test_displacement_mismatch_brakes_and_hands_over(
     assert other in decision.reason and other in gate.handover(now)
 
 
+@pytest.mark.parametrize(('height', 'climb', 'end'), [
+    (1.5, 0.0, ''),  # a wall below, or a door
+    (0.0, 2.5, 'displacements')])
+def test_a_jump_of_the_sensor_alone_is_no_displacement(height, climb, end):
+    gate, handovers = fresh_gate(), []
+    for now in np.arange(10.0, 20.0, 0.05):
+        later = max(now - 14.0, 0.0)
+        gate.take_motion('odom', MotionReport(
+            [0.0, 0.0, climb * (later > 0.0)], 0.5, [0.0, 0.0, climb * later]), 0.0, now)
+        gate.take_height(2.0 + height * (later > 0.0), now)
+        gate.take_command(Command(FORWARD, 1.0), 0.0, now)
+        decide(gate, now)
+        handovers.append(gate.handover(now))
+    assert gate.heights.stepped > 14.0
+    assert next(filter(None, handovers), '').startswith(end) and bool(end) == any(handovers)
+    assert not any(handovers[:81])
+
+
+def test_a_velocity_that_comes_late_replaces_no_newer_one():
+    gate = fresh_gate()
+    assert gate.take_motion('odom', MotionReport((0.9, 0.0, 0.0)), 0.2, 10.0) == ''
+    assert gate.speed(10.0) == pytest.approx(0.1)
+
+
+def along(gate, source, start, velocity, begin, seconds, offset=0.0):
+    """Fly along x by a source's positions; return the last of them, m, and its time, s."""
+    for now in np.arange(begin, begin + seconds, 0.05):
+        x = start + velocity * (now - begin)
+        gate.take_motion(source, MotionReport(
+            [velocity, 0.0, 0.0], 0.0, [x - offset, 0.0, 2.0]), 0.0, now)
+        decide(gate, now)
+    return x, now
+
+
+@pytest.mark.parametrize(('pause', 'velocity'), [(0.1, 0.5), (0.6, 0.5), (2.9, 0.0), (2.9, 0.5)])
+def test_odometry_that_starts_anew_keeps_the_radius(pause, velocity):
+    gate = fly(Gate(LIMITS), 10.0)
+    x, now = along(gate, 'odom', 0.0, 1.0, 10.0, 30.0)
+    along(gate, 'odom', x, velocity, now + pause, 1.0, offset=x)
+    far = x + velocity * (pause + 1.0)
+    assert gate.place(now + pause).offset[0] == pytest.approx(far, abs=1.5)
+
+
+def test_motion_while_odometry_pauses_is_no_jump():
+    gate = fly(Gate(LIMITS), 10.0)
+    x, now = along(gate, 'odom', 0.0, 2.0, 10.0, 5.0)
+    # It brakes by 2 m/s^2.
+    along(gate, 'odom', x + 1.0, 0.0, now + 1.5, 0.2)
+    assert gate.place(now + 1.5).offset[0] == pytest.approx(x + 1.0)
+
+
+def test_odometry_that_comes_in_flight_keeps_the_radius():
+    gate = fly(Gate(LIMITS), 10.0)
+    x, now = along(gate, 'autopilot', 100.0, 1.0, 10.0, 20.0)
+    x, now = along(gate, 'odom', x, 1.0, now + 0.05, 5.0, offset=500.0)
+    assert gate.place(now).offset[0] == pytest.approx(x - 100.0, abs=0.1)
+
+
 def test_command_is_accepted_only_while_active():
     gate = Gate(LIMITS)
     assert gate.take_motion('odom', MotionReport((0.1, 0.0, 0.0)), 0.0, 10.0) == ''

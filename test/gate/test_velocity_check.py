@@ -205,7 +205,9 @@ def test_what_is_old_or_interrupted_is_not_compared():
 
 @pytest.mark.parametrize(('axis', 'drift', 'std', 'height', 'contradicts'), [
     (0, 0.6, 0.0, False, True), (1, -0.6, 0.0, False, True), (1, 0.4, 0.0, False, False),
-    (1, 0.6, 0.25, False, False), (2, 0.6, 0.0, False, False),
+    (1, 0.6, 0.25, False, False), (1, 1.4, 0.5, False, False),
+    # The drift since the start says nothing of the last seconds.
+    (1, 1.6, 100.0, False, True), (2, 0.6, 0.0, False, False),
     (2, 1.0, 0.0, True, True), (2, -1.0, 0.0, True, True), (2, 0.8, 0.0, True, False),
     (2, 1.0, 0.4, True, False), (1, 2.0, 0.0, True, False)])
 def test_displacement_mismatch_beyond_deviation_is_reported(

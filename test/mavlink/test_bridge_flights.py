@@ -21,7 +21,10 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.gate.gate import Gate
+from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.global_origin import NO_HEIGHT
+from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 
 pytestmark = pytest.mark.slow
@@ -90,6 +93,37 @@ def test_lost_odometry_behind_autopilot_estimate_ends_stream(personality, action
     landing = flight.bridge.blind_landing
     assert (landing is not None and landing.outcome.success) == (action == 'land')
     assert action == 'land' or not flight.commands(mavlink.MAV_CMD_DO_SET_MODE, lost)
+
+
+@BOTH
+@pytest.mark.parametrize('ends', [False, True])
+def test_a_pilot_who_took_over_on_a_dead_line_is_left_alone(personality, ends):
+    """Without odometry, too, the bridge falls silent; it may not know the mode any more."""
+    dead = [Fault('drop', 6.0, direction='sent')]
+    flight = Flight(personality, faults=dead).follow(2.0)
+    flight.fly_until(lambda: flight.now > 6.0, 10.0)
+    flight.odometry = False
+    flight.fly(0.5)
+    flight.controller.pilot_switches(flight.modes.manual)
+    flight.fly(1.0)
+    if ends:
+        flight.bridge.stop(flight.now)
+        flight.bridge.finish(flight.now)
+    flight.fly(4.0)
+    assert flight.mode == flight.modes.manual
+
+
+@BOTH
+def test_bridge_restarted_in_a_take_off_knows_its_height(personality):
+    flight = Flight(personality, start='armed', parameters={'MIS_TAKEOFF_ALT': 8.0} if (
+        personality == 'px4') else {})
+    flight.fly(7.0)
+    flight.bridge.requests.takeoff(8.0, flight.now)
+    flight.fly_until(lambda: flight.vehicle.position[2] > 4.0, 20.0)
+    flight.bridge = Bridge(Link(flight.wire), Gate(), now=flight.now)
+    flight.fly(8.0)
+    assert flight.bridge.gate.heights.height(flight.now) == pytest.approx(
+        flight.vehicle.position[2], abs=0.3)
 
 
 def test_congested_line_sends_setpoints_and_no_odometry():

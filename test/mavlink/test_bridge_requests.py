@@ -77,6 +77,7 @@ def test_what_was_waived_is_not_refused():
 @pytest.mark.parametrize(('options', 'waits', 'height', 'reason'), [
     ({'start': 'landed'}, 0.0, 2.5, 'no HEARTBEAT from the autopilot'),
     ({'start': 'landed'}, 1.5, 2.5, 'disarmed: arm first'), ({}, 1.5, 2.5, 'already in the air'),
+    (never('EXTENDED_SYS_STATE'), 1.5, 2.5, 'does not report whether it flies'),
     ({'start': 'armed', **never('LOCAL_POSITION_NED')}, 1.5, 2.5,
      'the height reached would be unknown'),
     ({'start': 'armed', 'parameters': {'MIS_TAKEOFF_ALT': 10.0}}, 7.0, 1.0,

@@ -107,7 +107,10 @@ def test_the_link_is_alive_while_any_message_comes(came, now, alive):
     # (ms since boot, reboots so far)
     [(5000, 0), (4500, 0), (6000, 0), (300, 0), (320, 1), (900, 1), (100, 1)],
     # One that comes late is none, nor are stamps that are not set.
-    [(60_000, 0), (60_020, 0), (58_800, 0), (60_040, 0), (58_820, 0), (0, 0), (60_060, 0)]])
+    [(60_000, 0), (60_020, 0), (58_800, 0), (60_040, 0), (58_820, 0), (0, 0), (60_060, 0)],
+    # They wrap after 50 days.
+    [(2**32 - 30, 0), (2**32 - 10, 0), (10, 0), (30, 0), (2**32 - 5, 0), (50, 0), (70, 0)],
+    [(2**32 - 90_000, 0), (10, 0), (30, 1)]])
 def test_an_autopilot_whose_clock_falls_back_has_rebooted(stamps):
     telemetry = Telemetry()
     for boot_ms, reboots in stamps:
@@ -116,6 +119,14 @@ def test_an_autopilot_whose_clock_falls_back_has_rebooted(stamps):
         telemetry.update(stamped('ATTITUDE_QUATERNION', boot_ms), 1.0)
         assert telemetry.reboots == reboots, boot_ms
         assert telemetry.newest.get('HOME_POSITION') == (known if before == reboots else None)
+
+
+@pytest.mark.parametrize(('quality', 'altitude'), [(0, 1.5), (1, None), (100, 1.5)])
+def test_a_rangefinder_without_a_valid_signal_has_no_altitude(quality, altitude):
+    known = received(mavlink.MAVLink_distance_sensor_message(
+        0, 10, 1000, 150, 0, 0, mavlink.MAV_SENSOR_ROTATION_PITCH_270, 0,
+        signal_quality=quality)).sensor_altitude
+    assert altitude == (None if known is None else known.altitude)
 
 
 @pytest.mark.parametrize(('state', 'flying'), [

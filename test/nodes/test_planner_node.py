@@ -249,8 +249,9 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         START + round((elapsed + shift) * 1e9), 100.0 + elapsed))
     monkeypatch.setattr(rig.node, 'get_clock', lambda: SimpleNamespace(
         now=lambda: SimpleNamespace(nanoseconds=rig.node.read_clocks()[0])))
+    rig.give('camera_info', CameraInfo(width=640, height=480, k=CAMERA))
     rig.call('engage', data=True)
-    for tick in range(100):
+    for tick in range(104):
         elapsed = 0.1 * tick
         stamps = [START + round((elapsed + shift - age) * 1e9) for age in (0.01, 0.06)]
         if tick == 50:
@@ -259,9 +260,13 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         rig.node._even_clock.now()
         for topic, stamp, child, place in (('odom', stamps[0], 'base_link', (0.0, 0.0, 2.0)),
                                            ('neighbors', stamps[1], 'leader', AHEAD)):
-            rig.give(topic, to_odometry(nanoseconds_to_stamp(stamp), 'odom', child, place,
-                                        IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+            if topic == 'odom' or tick < 100:  # then it is covered by an obstacle
+                rig.give(topic, to_odometry(nanoseconds_to_stamp(stamp), 'odom', child, place,
+                                            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+        rig.give('neighbors/frames', Header(stamp=nanoseconds_to_stamp(stamps[1])))
         rig.node._tick()
+        state, reason = rig.node._decision[:2]
+        assert state == ('HOLD' if tick >= 102 else 'TRACK'), reason
         assert len(commands) == tick + 1
         sent = stamp_to_nanoseconds(commands[-1].header.stamp) + stamp_to_nanoseconds(
             commands[-1].points[0].time_from_start)

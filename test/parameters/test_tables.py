@@ -30,7 +30,7 @@ from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
 from flock_follower.parameters.cameras import cameras
 from flock_follower.parameters.files import parse_parameters, read_parameters
 from flock_follower.parameters.flight_names import FLIGHT_NAMES
-from flock_follower.parameters.spec import check_values, EACH
+from flock_follower.parameters.spec import check_values
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.planner.parameter_table import planner_params
 
@@ -104,5 +104,4 @@ def test_a_user_without_a_home_folder_has_a_folder_of_recordings(
 
 
 def test_the_names_of_flight_parameters_are_those_of_the_tables() -> None:
-    assert {spec.name for specs in TABLE.values() for spec in specs
-            if EACH not in spec.name} == FLIGHT_NAMES
+    assert {spec.name for specs in TABLE.values() for spec in specs} == FLIGHT_NAMES

@@ -217,3 +217,40 @@ def test_a_jump_back_in_time_forgets_all() -> None:
     course.see(course.leader)
     assert course.tracks.candidates == []
     assert course.estimate.stamp == DT
+
+
+def pose_outcomes(marked: bool, speed: float, outlier: Array, at: int) -> list[UpdateOutcome]:
+    """Return the outcomes of poses at 10 Hz, of which one is off by ``outlier`` (3,), m."""
+    tracks, random = Hypotheses(PARAMS, marked), np.random.default_rng(1)
+    noise: Array = np.diag([0.03] * 3 + [0.1] * 3)**2
+    found = []
+    for k in range(40):
+        place = START + random.normal([0.1 * k * speed, 0.0, 0.0], 0.03)
+        found.append(tracks.take(
+            0.1 * k, Transform(translation=place + outlier if k == at else place), np.zeros(3),
+            noise).outcome)
+    return found
+
+
+def test_a_track_that_began_with_an_outlier_begins_anew() -> None:
+    begun = pose_outcomes(False, 0.0, np.array([0.0, 1.0, 0.0]), 0)
+    assert begun[:4] == [UpdateOutcome.STARTED, *[UpdateOutcome.OUTLIER] * 2,
+                         UpdateOutcome.STARTED]
+    assert UpdateOutcome.OUTLIER not in begun[4:]
+    # A marker may be one on a wall: one that has not moved has to wait.
+    marked = pose_outcomes(True, 0.0, np.array([0.0, 1.0, 0.0]), 0)
+    assert marked[1:] == [UpdateOutcome.OUTLIER] * 39
+
+
+@pytest.mark.parametrize('length', [0.3, 1.2, 3.0])
+@pytest.mark.parametrize('towards', [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.7, 0.7)])
+def test_the_place_of_an_outlier_takes_no_later_pose(
+        length: float, towards: tuple[float, float]) -> None:
+    outlier = length * np.array([*towards, 0.0])
+    found = pose_outcomes(False, 1.2, outlier, 15)
+    assert UpdateOutcome.OUTLIER not in found[:15] + found[16:]
+
+
+def test_the_place_of_a_marker_elsewhere_takes_those_near_it() -> None:
+    assert UpdateOutcome.OUTLIER in pose_outcomes(
+        True, 1.2, np.array([1.2, 0.0, 0.0]), 15)[16:]

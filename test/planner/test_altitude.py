@@ -144,6 +144,32 @@ def test_start_below_altitude_min_neither_jumps_nor_descends() -> None:
 def test_unknown_ground_limits_it_to_its_starting_height() -> None:
     altitude = Altitude.begin(me(3.0), None, PARAMS)
     assert followed(altitude, leader(1.0), 10.0).held == 3.0
+    below = Altitude.begin(me(3.0), None, replace(PARAMS, altitude_min=-9.0, altitude_max=-2.0))
+    assert (below.lowest, below.highest) == (3.0, 3.0)
+
+
+@pytest.mark.parametrize(('ground', 'begun', 'changes', 'lowest', 'highest'), [
+    (0.5, 4.0, {'altitude_max': 3.0}, 1.6, 3.4), (0.5, 4.0, {'altitude_min': 5.0}, 5.6, 100.4),
+    (0.5, 1.0, {'altitude_max': 3.0}, 1.0, 3.4),  # it began below altitude_min
+    (None, 4.0, {'altitude_max': 3.0}, 4.0, 7.0), (None, 4.0, {'altitude_min': 2.0}, 4.0, 104.0)])
+def test_bounds_that_change_in_flight_count_at_once(
+        ground: float | None, begun: float, changes: dict[str, float], lowest: float,
+        highest: float) -> None:
+    altitude, params = Altitude.begin(me(begun), ground, PARAMS), replace(PARAMS, **changes)
+    assert altitude.with_limits_of(PARAMS) is altitude
+    bounded = altitude.with_limits_of(params)
+    assert (bounded.lowest, bounded.highest) == pytest.approx((lowest, highest))
+    assert bounded.with_limits_of(params) is bounded
+
+
+def test_a_ceiling_lowered_in_flight_is_obeyed() -> None:
+    follower = Follower()
+    follower.position[2] = 3.0
+    for tick in range(150):
+        if tick == 20:
+            follower.params = replace(follower.params, altitude_max=2.5)
+        follower.tick(seen(follower.now, (2.12, 0.0, 3.0)))
+    assert follower.position[2] == pytest.approx(2.4, abs=0.05)
 
 
 def test_behind_a_leader_that_climbs_steadily_nothing_lags() -> None:

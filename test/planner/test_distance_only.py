@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
+from flock_follower.planner.bound_keeping import SEPARATION
 from flock_follower.planner.bounds import clear_of_sphere, DEVIATIONS
 from flock_follower.planner.inputs import distance_known, Neighbor
-from flock_follower.planner.limits import SEPARATION
 from flock_follower.planner.modes import State
 from flock_follower.planner.step import Decision
 

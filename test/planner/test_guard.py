@@ -26,10 +26,11 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
+from flock_follower.planner.bound_keeping import Bound, COHESION, SEPARATION
+from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.guard import sort_bounds
-from flock_follower.planner.limits import Bound, COHESION, limit_command, SEPARATION
-from flock_follower.planner.limits import keep_bounds as guard
+from flock_follower.planner.limits import limit_command
 from flock_follower.planner.params import EDGE_RETURN_SPEED, Edges, GuardParams
 
 LAW = FlockingParams(beta=0.25, d1=8.0)

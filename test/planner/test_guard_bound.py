@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 
 from flock_follower.flocking import FlockingParams
+from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.guard import sort_bounds
-from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.params import EDGE_RETURN_SPEED, Edges, GuardParams
 
 PARAMS = GuardParams()

@@ -26,6 +26,8 @@ from numpy.typing import ArrayLike
 import pytest
 
 from flock_follower.geometry import Array
+from flock_follower.planner.bound_keeping import Bound
+from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import in_sight
 from flock_follower.planner.guard import (
     climb_range,
@@ -37,8 +39,7 @@ from flock_follower.planner.guard import (
     sort_bounds,
 )
 from flock_follower.planner.inputs import Neighbor, Prediction
-from flock_follower.planner.limits import Bound, LimitedCommand
-from flock_follower.planner.limits import keep_bounds as guard
+from flock_follower.planner.limits import LimitedCommand
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.scene import across_path

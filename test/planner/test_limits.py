@@ -24,13 +24,8 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.limits import (
-    brake,
-    limit_command,
-    limit_horizontal,
-    limit_norm,
-    SENT_INSIDE,
-)
+from flock_follower.planner.bound_keeping import limit_horizontal
+from flock_follower.planner.limits import brake, limit_command, limit_norm, SENT_INSIDE
 
 A_MAX = 2.5
 V_MAX = 0.5

@@ -209,6 +209,9 @@ def test_odometry_that_comes_late_does_not_replace_newer() -> None:
     (leader(1.2), 'ahead of the clock', 'by 0.20 s'),
     (leader(1.0, position_covariance=np.eye(3)), 'too uncertain', 'variance of its position 3'),
     (leader(1.0, velocity_covariance=np.eye(3)), 'too uncertain', 'variance of its velocity 3'),
+    *((leader(1.0, position_covariance=np.array([
+        [1e-4, number, 0.0], [number, 1e-4, 0.0], [0.0, 0.0, 1e-4]])), 'too uncertain',
+       'invalid covariance of its position') for number in (math.nan, math.inf, 1.0, -1.0)),
     (leader(1.0, velocity_covariance=np.full((3, 3), np.nan)), 'too uncertain',
      'variance of its velocity nan'),
 ])

@@ -22,12 +22,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.messages import (
-    OdometryChoice,
-    OdometryState,
-    RELATIVE,
-    RELATIVE_ACCELERATION_MAX,
-)
+from flock_follower.messages import OdometryState, RELATIVE, RELATIVE_ACCELERATION_MAX
+from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State

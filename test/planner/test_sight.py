@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, GRAVITY
+from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import (
     COLUMN_ANGLE,
     in_sight,
@@ -35,10 +36,15 @@ from flock_follower.planner.bounds import (
 )
 from flock_follower.planner.guard import sort_bounds
 from flock_follower.planner.inputs import Neighbor, Prediction
-from flock_follower.planner.limits import keep_bounds as guard
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
-from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion, WIDEST
+from flock_follower.planner.sight import (
+    FieldOfView,
+    MOST_PATIENT,
+    Occlusion,
+    occlusion,
+    WIDEST,
+)
 
 PARAMS = PlannerParams(v_max=5.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
@@ -205,6 +211,24 @@ def test_three_images_in_a_row_without_it_make_it_occluded() -> None:
     for beside in (leader(0.7, y=1.0), leader(0.7, y=-1.0), leader(0.7, z=2.8),
                    leader(0.7, z=1.2), leader(0.7, x=-2.0), leader(0.7, x=0.3)):
         assert occlusion(None, beside, ME, frames(0.8, 0.9, 1.0), AHEAD, 0.0) is None
+
+
+def test_of_another_detector_five_missed_images_make_it_occluded() -> None:
+    bare, late = leader(0.7)._replace(member=Member(faces=())), own(1.15)
+    four = frames(0.8, 0.9, 1.0, 1.1)
+    assert occlusion(None, bare, late, four, AHEAD, 0.0) is None
+    assert occlusion(None, bare, late, [*four, 1.12], AHEAD, 0.0) == Occlusion(0.7)
+
+
+@given(st.lists(st.floats(0.3, 2.4), max_size=12), st.floats(0.3, 2.4))
+def test_occlusion_of_another_detector_waits_only_for_a_while(
+        stamps: list[float], newest: float) -> None:
+    """Never earlier than with a marker; from MOST_PATIENT on, at the same time."""
+    me, images = own(2.4), sorted(stamps)
+    marked = leader(newest)
+    bare = occlusion(None, marked._replace(member=Member(faces=())), me, images, AHEAD, 0.0)
+    strict = occlusion(None, marked, me, images, AHEAD, 0.0)
+    assert bare == strict if me.stamp - newest >= MOST_PATIENT else bare in (None, strict)
 
 
 def test_camera_tilted_by_acceleration_looks_elsewhere() -> None:

@@ -27,7 +27,6 @@ from flock_follower.command_messages import Command
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import OdometryState, RELATIVE
 from flock_follower.view.flight import (
-    Battery,
     clean,
     from_above,
     HISTORY_LENGTH,
@@ -37,6 +36,7 @@ from flock_follower.view.flight import (
     NEVER,
     NodeReport,
     shadow,
+    ShownBattery,
     ShownFlight,
 )
 from flock_follower.view.scene import BOX, ELLIPSOID, Shape
@@ -66,7 +66,7 @@ def flight(**planner: str) -> ShownFlight:
     made.take_report('mavlink_bridge', NodeReport(
         NOW, 0, 'running', {'autopilot': 'PX4', 'limited_by': 'v_max', 'setpoint': 'command'}))
     made.take_distance('leader', 2.0, NOW)
-    made.take_battery(Battery(NOW, 0.78, 15.8))
+    made.take_battery(ShownBattery(NOW, 0.78, 15.8))
     made.note('image', NOW)
     return made
 
@@ -114,7 +114,7 @@ def test_every_source_has_an_age_and_is_stale_after_its_limit() -> None:
 
 def test_a_page_is_json_and_has_no_number_that_is_not_finite() -> None:
     made = flight()
-    made.take_battery(Battery(NOW, math.nan, math.inf))
+    made.take_battery(ShownBattery(NOW, math.nan, math.inf))
     made.take_distance('leader', math.nan, NOW)
     for page in (made.page(NOW), ShownFlight().page(NOW), made.history(NOW)):
         json.dumps(page, allow_nan=False)

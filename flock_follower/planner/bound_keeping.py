@@ -1,0 +1,168 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The command nearest to the wanted one that keeps bounds on the acceleration, and the limits.
+
+The vertical part of a command has priority: only the horizontal part changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.messages import FASTEST_OWN, SANE
+from flock_follower.planner.limits import (
+    INSIDE_SHARE,
+    limit_command,
+    limit_norm,
+    LimitedCommand,
+    SENT_INSIDE,
+)
+from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, nearest_in_order, product
+from flock_follower.planner.vectors import scalar_product
+
+# Reasons of bounds.
+SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
+INSISTENCE = 10.0  # of cohesion beyond ``v_max``: see ``keep_bounds``
+STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
+
+
+class Bound(NamedTuple):
+    """A bound on the acceleration a (3,), m/s^2: normal . a >= least."""
+
+    normal: Sequence[float]
+    """(3,); it need not be of unit length."""
+    least: float
+    reason: str
+    distance: float = 0.0
+    """Distance of the neighbor that causes the bound, m."""
+    seen: bool = True
+    """Whether that neighbor is in sight."""
+
+
+def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
+                     v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
+    """
+    Limit an acceleration whose vertical part has priority over the horizontal one.
+
+    As :func:`limit_command`, but the horizontal part gets the rest of ``a_max`` and ``v_max``: the
+    law's pull may be far beyond both and would leave no climb.
+
+    :param nominal: acceleration (3,), m/s^2; its vertical part is not used.
+    :param vertical: acceleration, m/s^2, at most ``a_max``.
+    :param climb: vertical velocity, m/s, to which it finally leads: room is left for that.
+    """
+    v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
+    if not math.hypot(*v.tolist()) < SANE:  # NaN fails
+        return limit_command([*nominal[:2], vertical], v, a_max, v_max, period)
+    strongest = math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0))
+    horizontal = limit_norm(nominal[:2], strongest)
+    reasons = [] if horizontal.tolist() == nominal[:2].tolist() else ['a_max']
+    rising = max(abs(float(v[2]) + vertical * period), abs(climb))
+    fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
+    reached = v[:2] + horizontal * period
+    target = limit_norm(reached, fastest)
+    if target.tolist() != reached.tolist():
+        horizontal = limit_norm((target - v[:2]) / period, strongest)
+        reasons.append('v_max')
+    command = limit_command([*horizontal.tolist(), vertical], v, a_max, v_max, period)
+    binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
+    reason = ', '.join(binding) if 'finite' not in command.reason else command.reason
+    return LimitedCommand(command.acceleration, reason)
+
+
+def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
+                v_max: float, period: float) -> LimitedCommand:
+    """
+    Return the command that keeps the bounds and is nearest to the given one.
+
+    Its vertical part stays as it is. Of all horizontal accelerations with ``|a| <= a_max`` and
+    ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the nearest to ``command`` is taken.
+    With one neighbor: its radial part is clipped to the bounds, or as far towards them as the
+    limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
+    the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
+
+    If the bounds leave no room they are met one after the other in their order, each as nearly as
+    those before it allow. Cohesion beyond ``v_max`` is met less: only as nearly as by the velocity
+    nearest to ``INSISTENCE`` times the correction. Met to the last bit, it would take all speed
+    across for very little, and the command would switch from tick to tick.
+
+    :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
+    :param velocity: own velocity (3,), m/s.
+    :param required: the bounds, the most important first (see ``sort_bounds``).
+    """
+    a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
+    speed = math.hypot(*v.tolist())
+    # Above v_max already: the command may slow down, or keep the speed, but not add to it.
+    flyable = speed <= FASTEST_OWN
+    fastest = max(v_max, speed * INSIDE_SHARE) if flyable else v_max
+    requested = a.tolist()
+    if not flyable or not all(map(math.isfinite, requested)) or all(
+            scalar_product(each.normal, requested) >= each.least for each in required):
+        return limit_command(a, v, a_max, fastest, period)
+    # The bounds on which the horizontal part has an influence.
+    sides = [(complex(x, y), each.least - z * requested[2], each.reason)
+             for each in required for x, y, z in [each.normal]
+             if math.hypot(x, y) > STEEP]
+    bounds = [side[:2] for side in sides]
+    missed = [product(normal, complex(*requested[:2])) < least for normal, least in bounds]
+    if not any(missed):
+        return limit_command(a, v, a_max, fastest, period)
+    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
+    vertical, strongest = requested[2], a_max * SENT_INSIDE
+    left = float(v[2]) + vertical * period
+    within = complex(*(-v[:2] / period)), math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
+    goal = complex(*limit_norm(a, SANE)[:2])
+    for k, (normal, least) in enumerate(bounds):
+        if missed[k] and sides[k][2] == COHESION:
+            step = min(INSISTENCE * (least - product(normal, goal)), SANE) / abs(normal) ** 2
+            reached = Discs(*within, *within).best(goal + step * normal)
+            bounds[k] = normal, min(least, product(normal, reached))
+    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
+    firm = [bounds[k] for k in range(len(bounds)) if sides[k][2] != COHESION]
+    if len(firm) < len(bounds) and any(missed):
+        _yield_cohesion(goal, bounds, firm, sides, discs)
+    point = nearest_in_order(goal, bounds, discs)
+    limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
+    # The bounds that the command did not keep, and those that are active at the result.
+    acting = [k for k, (normal, least) in enumerate(bounds)
+              if missed[k] or product(normal, point) <= least + LENGTH_TOLERANCE]
+    axis = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
+        bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
+    binding = sorted({sides[k][2] for k in acting}, key=REASONS.index)
+    return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
+
+
+def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]],
+                    firm: Sequence[tuple[complex, float]],
+                    sides: Sequence[tuple[complex, float, str]], discs: Discs) -> None:
+    """
+    Reduce the cohesion bounds to the motion towards the neighbor that firm bounds leave.
+
+    Against an opposite firm bound only a motion across would still bring it a little nearer, and
+    that would be as hard as the vehicle can.
+    """
+    start = nearest_in_order(goal, firm, discs)
+    for k, (normal, least) in enumerate(bounds):
+        if sides[k][2] == COHESION and product(normal, start) < least:
+            room = min((max(product(other, start) - bound, 0.0) / -product(other, normal)
+                        for other, bound in firm if product(other, normal) < 0.0),
+                       default=math.inf)
+            bounds[k] = normal, min(least, product(normal, start) + room * abs(normal) ** 2)
