@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The desk: simulators and commands that prove the follower before it flies.
+The desk: simulators and commands that test the follower before it flies.
 
 It imports ``flock_follower``, which never imports the desk. Modules beside the folders are the
 commands (``python -m flock_desk.NAME``), the embedded autopilot and two nodes.

@@ -171,7 +171,7 @@ class Endpoint:
                 self._send(self.autopilot.receive(data, time.monotonic()))
 
     def step(self, now: float) -> None:
-        """Fly on to ``now``, s on the monotonic clock, and send the messages that are due."""
+        """Simulate until ``now``, s on the monotonic clock, and send the messages that are due."""
         self._send(self.autopilot.step(now))
 
     def close(self) -> None:

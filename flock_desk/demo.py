@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The demonstration: a recorded bag becomes MAVLink setpoints, judged against bounds.
+The demonstration: replays a bag to MAVLink setpoints, and compares the result with bounds.
 
 ``python -m flock_desk.demo`` starts replay, relative_pose, planner, mavlink_bridge and
 the embedded autopilot, each a process of its own, in a ROS domain and on a UDP port that

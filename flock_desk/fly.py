@@ -219,7 +219,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
 
 
 def scenario_bounds(flight: LiveFlight, summary: Mapping[str, Any]) -> list[FigureBound]:
-    """Return the bounds of `fly`; an outrun follower must warn instead of holding the band."""
+    """Return the bounds of `fly`; if the leader is too fast, a warning replaces the band."""
     params = flight.scenario.flight
     demanded = bounds('external' if flight.external else 'fly', {
         'near': nearest_allowed(flight.scenario), 'far': round(math.sqrt(params.d1), 2),
@@ -249,7 +249,7 @@ def nearest_allowed(scenario: Scenario) -> float:
 
 def column_figures(scenario: Scenario, flights: Mapping[str, LiveFlight]) -> dict[str, Any]:
     """
-    Return the figures of a column as a whole, while all of it flew the scenario.
+    Return the figures of a whole column, for the time in which all its vehicles flew.
 
     ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
     """

@@ -125,7 +125,7 @@ class Listener:
         """Take messages to other followers, at a time in ns."""
 
     def reject(self, reason: str, detail: str) -> None:
-        """Take the reason why something was dropped."""
+        """Take the reason for which an input was dropped."""
 
 
 #: After a silence of this, ns, nothing changes any more: the rest of the silence is skipped.
@@ -233,12 +233,12 @@ class Follower:
             self._control.heights.refer(height, self._seconds())
 
     def bridge_died(self, time: int) -> None:
-        """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
+        """Simulate the end of the bridge: no setpoint is sent; the planner keeps its state."""
         self.advance(time)
         self._bridge_ended = self._now
 
     def bridge_started(self, time: int, control: Gate) -> None:
-        """Let a new bridge start, without the state of the one before."""
+        """Simulate the start of a new bridge, without the state of the last bridge."""
         self.advance(time)
         self._control, self._bridge_ended = control, None
         self._announce_bridge_state()
@@ -318,7 +318,7 @@ class Follower:
             self._listener.reject('invalid neighbors', str(error))
 
     def frame(self, time: int, stamp: int) -> None:
-        """Take the stamp of a processed image, ns, with a neighbor in it or not."""
+        """Take the stamp of a processed image, ns, whether or not it shows a neighbor."""
         self.advance(time)
         self._see_frame(stamp)
 
@@ -342,8 +342,8 @@ class Follower:
         self._now = max(self._now, time)
 
     def finish(self) -> None:
-        """Process the images that still wait, without odometry: the inputs have ended."""
-        while (waited := self._waited()) is not None:
+        """Process the waiting images without odometry, because the inputs have ended."""
+        while (waited := self._wait_end()) is not None:
             self._now = max(self._now, waited)
             self._process_due()
 
@@ -353,7 +353,7 @@ class Follower:
         """Return seconds from the first event to a time, or now: near zero, floats are exact."""
         return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
 
-    def _waited(self) -> int | None:
+    def _wait_end(self) -> int | None:
         """Return the time, ns, at which the oldest image stops waiting for odometry, or None."""
         overdue = None if self.perceiver is None else self.perceiver.overdue
         # Rounded up: by then the image has waited long enough in seconds, too.
@@ -362,14 +362,14 @@ class Follower:
 
     def _run_until(self, time: int) -> None:
         while True:
-            times = [self._waited(), self._silence, self._next_tick, self._next_cycle]
+            times = [self._wait_end(), self._silence, self._next_tick, self._next_cycle]
             next_time = min(each for each in times if each is not None)
             if next_time > time:
                 return
             self._now = max(self._now, next_time)
             if next_time == times[0]:
                 self._process_due()
-                if self._waited() == next_time:  # seconds are rounded: long after the start
+                if self._wait_end() == next_time:  # seconds are rounded: long after the start
                     self._now += _ROUNDING
             elif next_time == times[1]:
                 self._silence = None

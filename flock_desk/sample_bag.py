@@ -79,8 +79,8 @@ class Variant:
     """None: raw mono8."""
 
 
-def _enlarged(width: int, height: int) -> Camera:
-    """Return the sample's lens on a finer sensor, which sees as much from left to right."""
+def _enlarge_lens(width: int, height: int) -> Camera:
+    """Return the sample's lens on a finer sensor with the same horizontal field of view."""
     small = Camera()
     finer = width / small.width
     return Camera(width, height, finer * small.focal_x, finer * small.focal_y,
@@ -99,9 +99,9 @@ VARIANTS = {
                                      (-0.0076, 0.0450, -0.0426, 0.0076)),
                        sensor=Sensor(vignetting=0.15)),
     # A sensor as large: each pixel has a fourth, a ninth of the sample's area and electrons.
-    'hd': Variant('1280 x 720', camera=_enlarged(1280, 720),
+    'hd': Variant('1280 x 720', camera=_enlarge_lens(1280, 720),
                   sensor=Sensor(full_well=3000.0, read_noise=6.0)),
-    'full_hd': Variant('1920 x 1080', camera=_enlarged(1920, 1080),
+    'full_hd': Variant('1920 x 1080', camera=_enlarge_lens(1920, 1080),
                        sensor=Sensor(full_well=1333.0, read_noise=4.0)),
     'blur': Variant('exposed for 25 ms', sensor=Sensor(exposure=0.025, sub_poses=12)),
     'dark': Variant('dusk: exposed for 12 ms, little light, much noise', sensor=Sensor(
@@ -110,7 +110,7 @@ VARIANTS = {
 
 
 class Recording:
-    """One flight as its topics show it; images are rendered when asked for."""
+    """The topics of one flight; images are rendered on request."""
 
     def __init__(self, variant: Variant, seed: int = 1) -> None:
         self.variant, self.seed = variant, seed
@@ -228,9 +228,9 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     recording = _recording(variant, seed)
     count = len(recording.image_stamps_ns)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix='.writing-') as scratch:
-        images = computed(partial(_rendered, variant, seed), range(count), jobs)
+        images = computed(partial(_render_images, variant, seed), range(count), jobs)
         with BagWriter(Path(scratch) / out.name) as bag:
-            for message in recording.messages(_counted(images, count, out.name)):
+            for message in recording.messages(_count_images(images, count, out.name)):
                 bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
         (Path(scratch) / out.name / FLOWN).write_text(PARAMETERS, encoding='utf-8')
         if out.exists():
@@ -241,12 +241,12 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
 _recording = lru_cache(maxsize=1)(Recording)  # one in each process that renders
 
 
-def _rendered(variant: Variant, seed: int, k: int) -> BagMessage:
+def _render_images(variant: Variant, seed: int, k: int) -> BagMessage:
     cv2.setNumThreads(1)
     return _recording(variant, seed).image(k)
 
 
-def _counted(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
+def _count_images(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
     """Yield the images, showing how many have been."""
     with progress(count) as bar:
         bar.set_description_str(f'{name}, {count} images')

@@ -15,8 +15,8 @@
 """
 Bird-flocking control of a follower drone that sees its leader with one camera.
 
-This package is all that flies. ``flock_desk`` simulates it. ``test/test_rooms.py`` says what each
-folder may import.
+This package contains all code that flies; ``flock_desk`` holds the simulators.
+``test/test_rooms.py`` lists what each folder may import.
 """
 
 from flock_follower import signals  # noqa: F401  # first: Ctrl-C during the other imports

@@ -70,7 +70,7 @@ class BridgeState(NamedTuple):
 
     @property
     def last_known(self) -> BridgeState:
-        """Return the state before the autopilot was lost, if it is lost; else this one."""
+        """Return the state, or if the autopilot is lost the state before the loss."""
         lost = self.name == NO_AUTOPILOT and self.reason.startswith(LOST)
         return parse(self.reason.removeprefix(LOST)) if lost else self
 
@@ -94,7 +94,7 @@ def parse(text: str) -> BridgeState:
 
 def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     """
-    Return the state of the bridge; after a silence it counts as absent.
+    Return the state of the bridge; a bridge that has been silent too long counts as absent.
 
     :param reported: the state in its last message; None without one.
     :param age: of that message, s, by a clock that neither stops nor jumps.

@@ -116,7 +116,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def too_busy(seen: Observations, findings: Sequence[Finding]) -> str:
-    """Return the load in words if nothing else prevents a flight, else ''."""
+    """Return the load as text if only the load prevents a flight, else ''."""
     faults = {finding.what for finding in findings if finding.level == ERROR}
     return str(seen.machine.load) if seen.busy and not ready(findings) and (
         faults <= {'processor'}) else ''

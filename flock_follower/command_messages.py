@@ -58,17 +58,22 @@ class Command(NamedTuple):
     yaw_rate: float = 0.0
     """rad/s, anticlockwise."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from a neighbor that would come too near: the part of the
-    acceleration along it is cut last. None without such a neighbor."""
+    """
+    Unit vector (3,) away from a neighbor that would come too near: limits reduce the acceleration
+    along this vector last. None without such a neighbor.
+    """
     frame: str = ''
     stamp: int = 0
     ahead: int = 0
     altitude: float = math.nan
-    """The altitude that it leads to, m, in the frame ``frame``; NaN if it leads to none."""
+    """The commanded altitude, m, in the frame ``frame``; NaN without one."""
     relative: bool = False
-    """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
+    """
+    Whether the command is based on the marker alone, without odometry; its frame is then
+    ``RELATIVE``.
+    """
     retreat: Array | None = None
-    """Velocity (3,), m/s, to brake to if odometry is lost: away from a neighbor that comes. None
+    """Velocity (3,), m/s, to brake to if odometry is lost: away from an approaching neighbor. None
     without such a neighbor."""
 
     def ages(self, now: int) -> tuple[float, float]:

@@ -15,7 +15,7 @@
 """
 Fast DDS of ROS 2: its profiles, and its shared memory.
 
-Names differ between version 2 (ROS 2 Jazzy) and 3 (Kilted). Discovery goes by UDP. Messages go
+Names differ between version 2 (ROS 2 Jazzy) and 3 (Kilted). Discovery uses UDP. Messages pass
 through files in /dev/shm; a process locks the file ``NAME_el`` beside each of its own and removes
 both at its end.
 """
@@ -68,7 +68,7 @@ def largest_shared_memory() -> int:
 
 def undelivered(opened: Iterable[str], user: int, folder: Path = SHARED_MEMORY) -> str:
     """
-    Return why shared memory delivers nothing to this process, or ''.
+    Return why this process receives nothing over shared memory, or ''.
 
     If its files are removed (a login that ends), belong to another user, or lie in another
     /dev/shm (a container), publishers are found, and their messages never arrive.

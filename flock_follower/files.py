@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Files: paths of those that the package ships, for every kind of installation; their text."""
+"""Paths and texts of the files that the package ships, for every kind of installation."""
 
 from __future__ import annotations
 

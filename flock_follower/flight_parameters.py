@@ -35,7 +35,7 @@ TABLE: Final = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER,
 def refuse_start(files: Sequence[str | Path], given: Mapping[str, Mapping[str, Any]],
                  namespace: str) -> None:
     """
-    Refuse what would end a node at each start: a launch would start it again for ever.
+    Refuse parameters with which a node ends at each start: a launch would restart it for ever.
 
     :param files: parameter files. :param given: values of parameters beside them, by node.
     :param namespace: of the nodes.

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The camera's lens: which ray each pixel sees, and which pixel sees a point."""
+"""The camera's lens: the ray of each pixel, and the pixel of each point."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Camera:
     """'plumb_bob' (k1, k2, p1, p2, k3) or 'equidistant' (k1, k2, k3, k4)."""
     distortion: tuple[float, ...] = (-0.116, 0.087, 0.0007, -0.0005, 0.0)
 
-    def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return where the lens shows directions (x, y, 1), before focal lengths and center."""
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return the distorted directions (x, y, 1), before focal lengths and center."""
         r2 = x * x + y * y
         if self.model == 'equidistant':
             radius = np.maximum(np.sqrt(r2), 1e-9)
@@ -76,7 +76,7 @@ class Camera:
             return xd * np.tan(angle) / radius, yd * np.tan(angle) / radius
         rays: tuple[Array, Array] = xd, yd
         for _ in range(30):  # a fixed point: contracting for every lens without folds
-            seen = self._distorted(*rays)
+            seen = self._distort(*rays)
             rays = rays[0] + xd - seen[0], rays[1] + yd - seen[1]
         return rays
 
@@ -88,11 +88,11 @@ class Camera:
         """
         aside = points[:, :2] / points[:, 2:]
         radius = np.maximum(np.hypot(aside[:, 0], aside[:, 1]), 1e-9)
-        x, y = self._distorted(*(aside.T * np.minimum(1.0, self._reach / radius)))
+        x, y = self._distort(*(aside.T * np.minimum(1.0, self._reach / radius)))
         return np.stack([self.focal_x * x + self.center_x, self.focal_y * y + self.center_y], 1)
 
     @cached_property
     def _reach(self) -> float:
-        """Return a tangent of the angle off the axis a little beyond that of all pixels."""
+        """Return the tangent of an angle off the axis slightly beyond that of all pixels."""
         u, v = (np.array([-0.5, size / 2, size - 0.5]) for size in (self.width, self.height))
         return float(1.1 * np.hypot(*self.rays(*np.meshgrid(u, v))).max())

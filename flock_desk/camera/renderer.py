@@ -16,8 +16,8 @@
 A rendered camera: a leader before its surroundings, through a distorting lens, onto a sensor.
 
 The surroundings are a stored panorama, out of focus and as the middle of the exposure shows it:
-everything but the leader is taken to be far away. Of the leader an image is the mean of poses
-spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
+everything but the leader is taken to be far away. The leader's image is the mean over poses that
+are spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
 center of the top-left pixel.
 """
 
@@ -70,7 +70,7 @@ class Sensor:
     read_noise: float = 12.0
     """Standard deviation, electrons."""
     gain: float = 1.5
-    """Share of the full well that a radiance of 1 fills, in the image's center."""
+    """Share of the full well that a radiance of 1 fills in the image's center."""
     gamma: float = 2.2
     vignetting: float = 0.35
     """Relative light 1 / (1 + this r^2)^2, r the tangent of the angle off axis; 1 is cos^4."""
@@ -188,7 +188,7 @@ class _Panorama:
                     _RAY_SPACING:_RAY_SPACING + self._shape[1]]
 
 
-def _around(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
+def _window_bounds(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
     """Return first and last + 1 column and row (2,) of the part of a window with pixels (n, 2)."""
     return (np.maximum(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN, low),
             np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN, high))
@@ -222,7 +222,7 @@ class _Drawing:
         if not ahead.any():
             return
         pixels = self._camera.project(np.where(ahead[:, None], points, 1.0))
-        low, high = _around(pixels[ahead], 0, (self._camera.width, self._camera.height))
+        low, high = _window_bounds(pixels[ahead], 0, (self._camera.width, self._camera.height))
         if not (low < high).all():
             return
         size = (high - low).tolist()
@@ -243,7 +243,7 @@ class _Drawing:
                 cv2.fillConvexPoly(fine, corners[part], (light[k] * face.value, 1.0),
                                    shift=_SHIFT)
                 continue
-            first, end = _around(pixels[part], low, high)
+            first, end = _window_bounds(pixels[part], low, high)
             if (first < end).all():
                 self._print(_part(fine, first - low, end - low, n),
                             _part(self._rays, first, end), points[part],

@@ -82,9 +82,9 @@ class CameraViews:
     def __init__(self, world: World, noise: PerceptionNoise) -> None:
         self._world, self._noise = world, noise
         scenario, m, rows = world.scenario, len(world.others), len(world.rows)
-        drawn = [_drawn(scenario, run, number) for run, number in world.rows]
+        drawn = [_random_draws(scenario, run, number) for run, number in world.rows]
         self._latency = np.stack([each[0] for each in drawn], axis=1)
-        self._drawn, self._visible = (
+        self._random_draws, self._visible = (
             np.concatenate([each[k] for each in drawn], axis=1) for k in (1, 2))
         self._names = [scenario.company.names[v] for _, number in world.rows
                        for v in world.others[number - 1]]
@@ -138,17 +138,17 @@ class CameraViews:
         found = self._visible[image] & self.in_sight.ravel() & (not world.odometry_lost)
         self.seen = self.seen | found.reshape(self.seen.shape)
         tilt = np.repeat(self._tilt.step(), m, axis=0)
-        covariance = relative_noise(offsets, self._noise, self._turning(offsets, eyes))
+        covariance = relative_noise(offsets, self._noise, self._angular_speeds(offsets, eyes))
         yaw_error = np.repeat(vio.yaw_error, m)
         offsets = turned(_tilt_offsets(offsets, tilt), yaw_error)
         # Along and across the line of sight are the covariance's own axes.
         drawn = sensing.noise * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
-                                          self._drawn[image, :, :3])
+                                          self._random_draws[image, :, :3])
         # As in perception, the filters live where own motion is smooth, their results in odom.
         measured = np.repeat(world.travel, m, axis=0) + offsets + drawn
         covariance = max(sensing.noise, 1e-3) ** 2 * covariance
         correction = vio.position - world.travel
-        velocity_noise = sensing.velocity_noise * self._drawn[image, :, 3:]
+        velocity_noise = sensing.velocity_noise * self._random_draws[image, :, 3:]
         yaws = (world.headings + yaw_error
                 + YAW_NOISE * self._turned[image] + self._askew)
         arrivals = np.maximum(now + self._latency[image],
@@ -156,7 +156,7 @@ class CameraViews:
         for images, arrival in zip(self._images, arrivals):
             images.append((arrival, now))
         for i in np.flatnonzero(found).tolist():
-            state = _updated(self._filters[i], now, measured[i], covariance[i])
+            state = _update_estimate(self._filters[i], now, measured[i], covariance[i])
             if state is not None:
                 self._send(arrivals[i // m], i, state._replace(
                     position=state.position + correction[i // m],
@@ -185,10 +185,10 @@ class CameraViews:
                 continue
             self.seen[row, 0] = True
             turn = attitudes[row] @ world.vehicle.rotation[row].T
-            noise = scale * np.linalg.cholesky(covariances[i]) @ self._drawn[image, i, :3]
-            state = _updated(self._alone.setdefault(row, NeighborFilter()), now,
-                             motion.position + turn @ (offsets[i] + noise),
-                             max(scale, 1e-3) ** 2 * covariances[i])
+            noise = scale * np.linalg.cholesky(covariances[i]) @ self._random_draws[image, i, :3]
+            state = _update_estimate(self._alone.setdefault(row, NeighborFilter()), now,
+                                     motion.position + turn @ (offsets[i] + noise),
+                                     max(scale, 1e-3) ** 2 * covariances[i])
             if state is not None:
                 self._send(now + self._latency[image, row], i, state, float(world.headings[i]),
                            relative=True)
@@ -248,8 +248,8 @@ class CameraViews:
             shown &= ~hidden(world.offsets, there, BODY) & there
         return shown.reshape(-1, m)
 
-    def _turning(self, offsets: Array, eyes: Array) -> Array:
-        """Return how fast the others have moved across the images since the last, rad/s."""
+    def _angular_speeds(self, offsets: Array, eyes: Array) -> Array:
+        """Return the angular speed of the others across the image since the last image, rad/s."""
         sight = np.einsum('nji,nj->ni', eyes, offsets)
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         before, self._sight = sight if self._sight is None else self._sight, sight
@@ -278,8 +278,8 @@ def _tilt_offsets(offsets: Array, tilt: Array) -> Array:
     return result
 
 
-def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
-             ) -> Estimate | None:
+def _update_estimate(track: NeighborFilter, now: float, place: Array, covariance: Array
+                     ) -> Estimate | None:
     """Return the estimate after a place (3,), m, of a covariance (3, 3); None if it is refused."""
     full = _POSE_COVARIANCE.copy()
     full[:3, :3] = covariance
@@ -289,7 +289,7 @@ def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
 
 T = TypeVar('T')
 _Coming = list[tuple[float, T]]
-"""What has been sent, in the order of sending, and when each arrives, s."""
+"""The sent items, in the order of sending, and their times of arrival, s."""
 
 
 def _due(coming: _Coming[T], now: float) -> list[T]:
@@ -299,7 +299,7 @@ def _due(coming: _Coming[T], now: float) -> list[T]:
     return due
 
 
-def _drawn(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any]:
+def _random_draws(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any]:
     """
     Return the random draws of the c images of one row.
 

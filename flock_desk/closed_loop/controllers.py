@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The controllers that flights are compared by, in place of the law and with or without the guard.
+The controllers that ``flights`` compares, in place of the law, with or without the guard.
 
 Each flies the same planner, limits, altitude and yaw. Without the guard they have no bounds:
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-A flight in lock step on the poses of another detector: no clock, no messages, no images.
+A lock-step flight with the poses of another detector, without clock, messages and images.
 
 The detector is simulated: true poses of the leader in the camera's frame, with noise, latency,
 missing poses and outliers. They take the way of the nodes: ``pose_sources``, filter, planner and
@@ -225,7 +225,7 @@ class DetectorFlight(Listener):
             self._speeds.append(float(np.linalg.norm(autopilot.vehicle.velocity)))
 
     def _call_services(self, now: float, time: int) -> None:
-        """Report the mode; call offboard and engage, and change the mode once it is allowed."""
+        """Report the mode; call offboard and engage, and change the mode once permitted."""
         controller = self._vehicle.autopilot.controller
         if self._steps % STATUS_STEPS == 0:
             self._follower.vehicle(time, VehicleStatus(

@@ -46,7 +46,7 @@ RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRID
 
 class _Reported:
     """
-    A vehicle by its motion, which comes step by step.
+    A vehicle whose motion is reported step by step.
 
     :param start_ns: time zero of the flight on the clock of ``motion``.
     :param origin: (3,), m, of the frame of ``motion`` in that of the flight.
@@ -89,7 +89,7 @@ class EmbeddedVehicle(_Reported):
         return self.autopilot.controller.mode == OFFBOARD
 
     def step(self, time_ns: int) -> Odometry:
-        """Return the true motion, without covariances, a step after that returned before."""
+        """Return the true motion, without covariances, one step after the last one returned."""
         vehicle, before = self.autopilot.vehicle, self._rotation
         self._rotation = vehicle.rotation
         self._motion.add(Motion(

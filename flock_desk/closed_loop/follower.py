@@ -129,13 +129,13 @@ class SimulatedFollower(Listener):
         """Whether the vehicle flies setpoints."""
 
     def _new_control(self) -> Gate:
-        """Return the control of a bridge that starts."""
+        """Return the setpoint control of a newly started bridge."""
         gate = Gate(self._limits)
         gate.autopilot = AutopilotTraits(needs_wind_offset=not PX4.compensates_wind)
         return gate
 
     def sense(self, now: float, own: OwnState | None) -> None:
-        """Take the newest odometry there is."""
+        """Take the newest odometry that has arrived."""
         if own is None or own is self._known or self.failed:
             return
         self._known, to_odom = own, self._T_odom_world
@@ -148,7 +148,7 @@ class SimulatedFollower(Listener):
             pose, twist, _LEVEL_ATTITUDE))
 
     def lean(self, now: float, quaternion: Array) -> OdometryState | None:
-        """Take the attitude by the autopilot; return the motion without odometry, if flown on."""
+        """Take the autopilot's attitude; return the motion without odometry, if it is flown."""
         return None if self.failed else self._follower.attitude(
             to_nanoseconds(now), quaternion, _ZERO_VECTOR)
 
@@ -185,7 +185,7 @@ class SimulatedFollower(Listener):
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
              estimate: Array, altitude: float) -> tuple[Array, float | None]:
         """
-        Let everything happen that is due; return the acceleration and yaw to fly from now on.
+        Process all due events; return the acceleration and yaw to fly from now on.
 
         :param altitude: by its barometer, m.
         """
@@ -257,7 +257,7 @@ class SimulatedFollower(Listener):
         return nominal, self._yaw
 
     def fail(self, now: float) -> None:
-        """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
+        """Simulate the failure of the vehicle's computer: the autopilot then hovers."""
         if not self.failed:
             self.failed, self.decision = True, Decision(State.IDLE)
             self._follower.bridge_died(to_nanoseconds(now))

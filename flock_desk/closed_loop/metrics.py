@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Simulated flights from engaging on: their record at every planner tick, and their figures.
+Simulated flights since ``engage``: their record at every planner tick, and their figures.
 
 All is true, not estimated. Each array has one row per follower, see ``world``. A single follower
 follows the leader. In a flock each follows the edges of its planner; before the first edge, the
@@ -119,7 +119,7 @@ class FlightsLog:
         distance, last = self._world.distances_at(self._moments), self._ticks[-1]
         self._moments = []
         band = self._world.scenario.flight
-        farthest, edges = self._along(distance)
+        farthest, edges = self._edge_distances(distance)
         last['nearest'] = np.minimum(last['nearest'], distance.min(axis=(0, 2)))
         last['farthest'] = np.maximum(last['farthest'], farthest.max(axis=0))
         out = edges & ((distance ** 2 <= band.d0) | (distance ** 2 >= band.d1))
@@ -128,7 +128,7 @@ class FlightsLog:
         share = np.where(many > 0, out.sum(axis=2) / np.maximum(many, 1), 1.0)
         last['outside'] = np.cumsum(COURSE_STEP * share, axis=0)[-1]
 
-    def _along(self, distance: Array) -> tuple[Array, Any]:
+    def _edge_distances(self, distance: Array) -> tuple[Array, Any]:
         """Return the greatest distance (..., n), and the edges (..., n, m), to those present."""
         edges = self._edges & np.isfinite(distance)
         return np.where(edges, distance, 0.0).max(axis=-1), edges
@@ -142,7 +142,7 @@ class FlightsLog:
             if world.scenario.flock is not None and decision.edges:
                 self._edges[row] = [self._names[v] in decision.edges for v in self._others[row]]
         distance = world.distances
-        farthest, edges = self._along(distance)
+        farthest, edges = self._edge_distances(distance)
         # The nearest that it follows.
         met = self._others[rows, np.where(edges, distance, np.inf).argmin(axis=1)]
         runs = rows // len(world.others)
@@ -258,8 +258,8 @@ def measure(flights: Flights) -> Measures:
         'velocity_error': _rms(np.linalg.norm(
             flights.velocity - flights.leader_velocity, axis=2), axis=1),
         'in_sight': flights.in_sight.mean(axis=1),
-        'out_of_sight': np.array([period * _longest(~seen) for seen in flights.in_sight]),
-        'detection_gap': np.array([period * _longest(~seen) for seen in flights.seen]),
+        'out_of_sight': np.array([period * _longest_run(~seen) for seen in flights.in_sight]),
+        'detection_gap': np.array([period * _longest_run(~seen) for seen in flights.seen]),
         'final_distance': distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
         'max_speed': fastest, 'speed_share': fastest / band.v_max,
         'handover_altitude': handovers[:, 0], 'handover_climb': handovers[:, 1],
@@ -269,7 +269,7 @@ def measure(flights: Flights) -> Measures:
 
 def of_runs(rows: Measures, flights: Flights) -> Measures:
     """Return the measures of the runs of a flock, of those of its followers, and some more."""
-    kept = _kept(flights)
+    kept = _find_counted(flights)
     by_run = len(flights.positions), -1
     tracking = flights.state == STATES.index(State.TRACK)
     rows = {**rows, 'tracking': tracking.mean(axis=1), 'edges': flights.edges.mean(axis=1),
@@ -279,7 +279,8 @@ def of_runs(rows: Measures, flights: Flights) -> Measures:
     runs = {name: reductions[name](values.reshape(by_run)[:, kept], axis=1)
             for name, values in rows.items()}
     late = flights.times > flights.times[-1] - LOST_AFTER
-    strayed = np.stack([_strayed(positions[-1], flights) for positions in flights.positions])
+    strayed = np.stack([_find_unconnected(positions[-1], flights)
+                        for positions in flights.positions])
     lost = ~tracking[:, late].any(axis=1).reshape(by_run) | strayed
     runs['lost'] = lost[:, kept].sum(axis=1).astype(float)
     return runs
@@ -304,7 +305,7 @@ def band_exits(flights: Flights) -> list[tuple[int, str]]:
         k = int(np.flatnonzero(flights.outside[row] > 0.0)[0])
         near = flights.nearest[row, k] ** 2 <= flights.scenario.flight.d0
         distance = (flights.nearest if near else flights.farthest)[row, k]
-        unseen = period * _longest(~flights.seen[row, :k + 1], at_the_end=True)
+        unseen = period * _longest_run(~flights.seen[row, :k + 1], at_the_end=True)
         exits.append((row, f'at {flights.times[k]:.1f} s too {"near" if near else "far"}, '
                            f'{distance:.2f} m; {STATES[int(flights.state[row, k])].value}, leader '
                            + (f'not seen for {unseen:.1f} s' if unseen else 'seen')))
@@ -333,26 +334,26 @@ def _stretches(values: Any) -> Any:
     return np.flatnonzero(edges).reshape(-1, 2)
 
 
-def _longest(missing: Array, at_the_end: bool = False) -> int:
-    """Return the greatest number of True in a row, or of those at the end."""
+def _longest_run(missing: Array, at_the_end: bool = False) -> int:
+    """Return the greatest number of consecutive True values, or of those at the end."""
     lengths = np.diff(_stretches(missing)).ravel()
     if at_the_end:
         return int(lengths[-1]) if missing[-1] else 0
     return int(np.max(lengths, initial=0))
 
 
-def _kept(flights: Flights) -> Any:
+def _find_counted(flights: Flights) -> Any:
     """Return which followers count (m,): all but the one that fails."""
     flock = flights.scenario.company
     return np.array([flock.fails is None or flock.fails.follower != number
                      for number in range(1, flock.followers + 1)])
 
 
-def _strayed(positions: Array, flights: Flights) -> Any:
+def _find_unconnected(positions: Array, flights: Flights) -> Any:
     """Return which followers (m,) are not connected to the leader; positions (m + 1, 3), m."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=2)
     near = apart < STRAYED * math.sqrt(flights.scenario.flight.d1)
-    near &= np.append(True, _kept(flights))  # a failed follower leads no other
+    near &= np.append(True, _find_counted(flights))  # a failed follower leads no other
     reached = np.arange(len(positions)) == 0
     for _ in positions:
         reached = reached | near[:, reached].any(axis=1)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-A flight of two vehicles as it goes on: the leader before, the follower as it is commanded.
+A running flight of two vehicles: the leader on its course, the follower by its commands.
 
 Its owner steps the vehicles and takes the output of the sensors: odometry after every step, an
 image when one is due. Times are integer nanoseconds since the start; no clock is
@@ -145,7 +145,7 @@ class RealTimeFlight:
         return float(radios.measure(np.array([self.distance]))[0])
 
     def look(self, now_ns: int) -> RenderedImage | None:
-        """Return the next image, if its exposure is over; leave out images that are too late."""
+        """Return the next image if its exposure is over; skip images that are too late."""
         while True:
             stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
             end_ns = stamp_ns + round(0.5e9 * CAMERA_SENSOR.exposure)

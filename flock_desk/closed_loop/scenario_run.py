@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The content of a scenario at a moment of one flight: the leader, the air, the light, delays."""
+"""The state of a scenario at a time of one flight: leader, air, light and delays."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class ScenarioRun:
         """Begin and end of each, s."""
 
     def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Bring the leader to a follower that has just come into offboard mode; turn it away."""
+        """Place the leader before a follower that has just entered offboard mode, facing away."""
         if not self._in_place and time < 0.0 and not offboard:
             self._frame = None
         elif self._frame is None and offboard:

@@ -120,7 +120,7 @@ class World:
         self._barometer = Barometer(self.random('barometer'))
 
     def random(self, what: str) -> list[np.random.Generator]:
-        """Return the generators of one thing that chance decides, one for each row."""
+        """Return the random generators of one purpose, one for each row."""
         return [self.scenario.random(run, what, number) for run, number in self.rows]
 
     def _starts(self, n: int) -> tuple[Array, Array]:
@@ -204,7 +204,7 @@ class World:
             self._sense(now)
 
     def placed(self, now: float) -> float:
-        """Return when there is odometry that is not older than now, s."""
+        """Return the time, s, at which odometry of now has arrived."""
         here = bool(self._odometry) and self._odometry[0][0].stamp == now
         return now if here else self._due.next
 

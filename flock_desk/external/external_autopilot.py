@@ -102,7 +102,7 @@ class ExternalAutopilot:
 
     @property
     def known(self) -> float:
-        """Return until when, s on the monotonic clock, the motion is known."""
+        """Return the time, s on the monotonic clock, until which the motion is known."""
         newest = self.motion.newest
         return -math.inf if newest is None else newest * 1e-9
 
@@ -110,7 +110,7 @@ class ExternalAutopilot:
         """
         Wait until the motion is known; take the autopilot's estimate if no truth comes.
 
-        :param why_truth: why an estimate will not do; '': it will.
+        :param why_truth: why an estimate is not sufficient; '': it is.
         :param wanted: returns whether to go on waiting.
         :raises ValueError: if nothing comes within ``timeout`` s, or no truth although it must.
         """
@@ -148,7 +148,7 @@ class ExternalAutopilot:
         return '' if status is None else status.mode
 
     def silence(self) -> str:
-        """Return, for people, why there is no pose."""
+        """Return the reason, as text, why there is no pose."""
         link = self._link
         if link.transport.fault:
             return link.transport.fault
@@ -216,7 +216,7 @@ class ExternalVehicles:
 
     def find(self, forwarded: bool, wanted: Callable[[], bool]) -> None:
         """
-        Wait until it is known where the vehicles are.
+        Wait until the positions of the vehicles are known.
 
         :param forwarded: whether the follower is sent odometry made of where it is.
         :param wanted: returns whether to go on waiting.
@@ -254,7 +254,7 @@ class ExternalVehicles:
         return {name: link.motion.source for name, link in self._links}
 
     def gone(self, now: float) -> str:
-        """Return, for people, that the follower is gone for good; '' while it is there."""
+        """Return a text if the follower's messages have ended for good; '' while they arrive."""
         return '' if now - self.known(now) <= LOST else (
             f'no pose of the vehicle for {LOST:g} s on {self.follower.url}: '
             f'{self.follower.silence()}')

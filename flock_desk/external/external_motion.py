@@ -50,7 +50,7 @@ _DEGREE = 111_320.0  # m along a meridian
 
 
 class Motion(NamedTuple):
-    """Where a vehicle is at a time and how it moves, ENU and FLU."""
+    """Position, attitude and velocities of a vehicle at a time, ENU and FLU."""
 
     time: int
     """ns."""
@@ -75,7 +75,7 @@ class ExternalMotion:
         self.source = ''
         """Name of the message that places it; '' until a truth comes, or ESTIMATE is set."""
         self.times: list[tuple[float, float]] = []
-        """Own time and the autopilot's since it booted, s: simulators may be slow."""
+        """Our time and the autopilot's time since boot, s: simulators may be slow."""
         self._poses: deque[Motion] = deque(maxlen=MEMORY)
         self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
         self.origin: Array | None = None
@@ -108,12 +108,12 @@ class ExternalMotion:
 
     @property
     def newest(self) -> int | None:
-        """Return until when, ns, the motion is known; None before anything is."""
+        """Return the time, ns, until which the motion is known; None before any motion."""
         return self._poses[-1].time if self._poses else None
 
     def knows(self, time: int) -> bool:
         """Return whether the motion at a time, ns, is known: between poses, and near to both."""
-        before, after = self._around(time)
+        before, after = self._adjacent_poses(time)
         return after is not None and (after.time == time or (
             before is not None and after.time - before.time <= POSE_GAP))
 
@@ -127,7 +127,7 @@ class ExternalMotion:
         """
         if not self._poses:
             raise ValueError('no pose has come yet')
-        before, after = self._around(time)
+        before, after = self._adjacent_poses(time)
         b = after or self._poses[-1]
         a = before if before and after else b
         share = 1.0 if a.time == b.time else (time - a.time) / (b.time - a.time)
@@ -135,7 +135,7 @@ class ExternalMotion:
             (a.position, b.position), (a.velocity, b.velocity), (a.angular, b.angular)))
         return Motion(time, position, velocity, slerp(a.quaternion, b.quaternion, share), angular)
 
-    def _around(self, time: int) -> tuple[Motion | None, Motion | None]:
+    def _adjacent_poses(self, time: int) -> tuple[Motion | None, Motion | None]:
         """Return the last pose before a time, and the first that is not."""
         after = None
         for pose in reversed(self._poses):  # the newest are asked for
@@ -183,7 +183,7 @@ class ExternalMotion:
 
     def _place(self, now: int, reported: Array, velocity: Array,
                turned: tuple[Array, Array]) -> None:
-        """Add a place by the time of arrival, smoothed by the velocity: its step is 1e-7 deg."""
+        """Add a position of resolution 1e-7 deg, smoothed with the velocity, at its arrival."""
         position = reported
         if self._poses:
             last = self._poses[-1]

@@ -82,7 +82,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams
              duration: float = 20.0, model: Model = 'flocking', led: bool = False,
              sample_period: float = 0.02) -> Simulation:
     """
-    Return how a flock moves from its positions and velocities, both (k, n) with n = 2 or 3.
+    Return the motion of a flock from initial positions and velocities, (k, n), n = 2 or 3.
 
     :param led: whether agent 0 is the paper's leader, which obeys ``leader_input`` alone.
     :param duration: s to simulate; :param sample_period: s between the times returned, at least
@@ -109,7 +109,7 @@ def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: Flocking
                    duration: float = 20.0, dt: float = 0.005, sample_period: float = 0.05,
                    progress: Callable[[], object] = lambda: None) -> Simulation:
     """
-    Return how a flock moves on its neighbor graph; see ``simulate``.
+    Return the motion of a flock on its neighbor graph; see ``simulate``.
 
     :param dt: s, the longest step.
     :param progress: called at each of the times returned.
@@ -211,7 +211,7 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
     Yield positions and velocities, both (k, n), at each time, by Dormand and Prince's 8(5,3).
 
     :param start: the state at ``times[0]``.
-    :param breaks: where the acceleration jumps, s: no step straddles these.
+    :param breaks: times at which the acceleration jumps, s: no step contains such a time.
     :raises RuntimeError: if no step is small enough, as at a singularity of the law.
     """
     from scipy.integrate import solve_ivp

@@ -61,7 +61,7 @@ class Metrics:
     """W, infinite if a pair is outside the band."""
 
     def time_to_agree(self, share: float = 0.01) -> float:
-        """Return from when on L stays below a share of its first value, s; NaN if never."""
+        """Return the time from which L stays below a share of its first value, s; NaN if never."""
         wanted = share * self.disagreement[0]
         above = np.flatnonzero(~(self.disagreement < wanted))  # NaN is no agreement
         if not len(above) or above[-1] == len(self.time) - 1:

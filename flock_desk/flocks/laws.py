@@ -86,7 +86,7 @@ def graph_accelerations(positions: Array, velocities: Array, params: FlockingPar
 def step_is_small(before: Array, after: Array, params: FlockingParams, edges: Pairs,
                   near: Pairs) -> bool:
     """
-    Return whether no pair comes more than halfway from where it is to a singularity of the law.
+    Return whether no pair moves more than half of its distance to a singularity of the law.
 
     :param before: positions (k, n), m; :param after: those a step later.
     :param near: all pairs with r^2 < d1 at least, of the positions before.

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where simulated flocks begin: the setups of Liu & Qiu (AAMAS 2020), and random starts."""
+"""Initial states of simulated flocks: those of Liu & Qiu (AAMAS 2020), and random ones."""
 
 from __future__ import annotations
 

@@ -69,12 +69,12 @@ def guarded(command: Callable[[], int], refused: int = 1,
 
 
 def logs_in(folder: Path) -> str:
-    """Return where the logs are, or '' if there are none, as in a folder that is read-only."""
+    """Return the place of the logs; '' without logs, as in a read-only folder."""
     return f'; the logs of every process are in {folder}' if any(folder.rglob('*.log')) else ''
 
 
 def explained(error: Exception) -> str:
-    """Return an error in one line, that of a file with the file's name."""
+    """Return an error as one line; the line names the file if the error has one."""
     if isinstance(error, OSError) and error.filename:
         return f'{error.filename}: {error.strerror}'
     return ' '.join(str(error).split())

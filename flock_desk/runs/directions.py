@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether commands point along the law, and setpoints along what they rest on."""
+"""Checks that commands point along the law, and setpoints along their commands."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def along_law(commands: Iterable[Any], neighbors: Sequence[OdometryState],
 
 def opposed(log: Mapping[str, Array], commands: Sequence[tuple[float, Any]]) -> NDArray[np.bool_]:
     """
-    Return whether each setpoint points against what it rests on.
+    Return whether each setpoint points against its command or along the velocity.
 
     With fresh commands: horizontally against each of them, and not against the velocity either,
     because the gate may brake, and on a busy machine rests on a command before the newest; its

@@ -15,8 +15,8 @@
 """
 One bag through perception, planner and gate, and the record of it.
 
-A message comes when it was recorded, so images and odometry are as late, and in the same order,
-as they were in flight. The planner is engaged and the vehicle armed, in the air and in offboard
+Each message is processed at its recording time, so images and odometry have the latency and the
+order of the flight. The planner is engaged and the vehicle armed, in the air and in offboard
 mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
 ``odom`` replace them if ``velocity_source`` requires them.
 """
@@ -222,7 +222,7 @@ class Evaluation(Listener):
         """
         Return whether times step before a message recorded at a time, ns: then begin anew.
 
-        What was computed before the step has no meaning after it. The figures leave it out.
+        Results from before the step are invalid after it. The figures omit the step.
         """
         if not self._gaps.take(time):
             return False
@@ -307,7 +307,7 @@ class Evaluation(Listener):
 
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
-        self.errors.odometry(self._moved(state))
+        self.errors.odometry(self._close_gaps(state))
         if self.own is not None and state.stamp < self.bag.start_ns + MAX_DURATION * NANOSECONDS:
             self.own.states.append(state)
 
@@ -356,13 +356,13 @@ class Evaluation(Listener):
     def _seconds(self, nanoseconds: int) -> float:
         return (nanoseconds - self._skipped_ns - self.bag.start_ns) / NANOSECONDS
 
-    def _moved(self, state: OdometryState) -> OdometryState:
+    def _close_gaps(self, state: OdometryState) -> OdometryState:
         """Return a state with its stamp as if the bag had no gaps."""
         return state._replace(stamp=state.stamp - self._skipped_ns) if self._skipped_ns else state
 
     def truth(self, state: OdometryState, own: bool) -> None:
         """Take the true state of the follower, or of a neighbor."""
-        self.errors.truth(self._moved(state), own=own)
+        self.errors.truth(self._close_gaps(state), own=own)
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,

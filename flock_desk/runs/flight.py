@@ -86,7 +86,7 @@ class Flown(NamedTuple):
     load: Load | None
     """During the flight; None if it is unknown."""
     late: str
-    """What was too late to fly the scenario to its end; '' if it was flown."""
+    """The step that was too late to complete the scenario; '' if it was completed."""
 
 
 def links(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') -> External:
@@ -105,7 +105,7 @@ def links(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') 
 
 
 def namespaces(followers: int) -> list[str]:
-    """Return the namespace of each, '' for one alone; the folder of its logs has that name."""
+    """Return each follower's namespace ('' for a single one), the name of its logs' folder."""
     return [''] if followers == 1 else [f'follower_{i}' for i in range(1, followers + 1)]
 
 
@@ -352,7 +352,7 @@ def ended_by_bridge(log: str) -> str:
 
 
 def come_down(processes: Processes) -> None:
-    """Request a landing after something failed, whether it succeeds or not."""
+    """Request a landing after a failure; ignore the result."""
     with contextlib.suppress(RuntimeError, KeyboardInterrupt):
         answer = processes.ask('mavlink_bridge/land', LAND_TIMEOUT, value=())
         print(f'\n{answer}', flush=True)

@@ -141,7 +141,8 @@ class FrameErrors:
         """
         stamps = np.array(self._stamps)
         own, true_own, true = (
-            _at(states, stamps) for states in (self._own, self._true[''], self._true[name]))
+            _interpolate(states, stamps)
+            for states in (self._own, self._true[''], self._true[name]))
         seen = np.array(self._seen[name]).reshape(-1, _SIGHTING_LENGTH)
         position, velocity, rotation = seen[:, 1:4], seen[:, 4:7], seen[:, 7:16]
         covariance = seen[:, 16:].reshape(-1, 6, 6)
@@ -195,7 +196,7 @@ def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transfor
     return np.asarray(inside & facing)
 
 
-def _at(states: array[float], stamps: Array) -> _States:
+def _interpolate(states: array[float], stamps: Array) -> _States:
     """
     Return the states at stamps (n,), ns, between two states at most half a second apart.
 

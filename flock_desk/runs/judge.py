@@ -104,7 +104,7 @@ def parse_bounds(document: Any) -> list[FigureBound]:
 
 def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> None:
     """
-    Refuse a bound on something that is no figure of the summary.
+    Refuse a bound on a name that is no figure of the summary.
 
     :raises ValueError: naming it, and the figures of similar names, or all.
     """

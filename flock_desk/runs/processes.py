@@ -132,7 +132,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 class LateError(RuntimeError):
-    """Something did not happen in time, which a busy machine explains."""
+    """An event did not happen in time; a busy machine can be the cause."""
 
 
 class TooBusyError(Exception):
@@ -151,7 +151,7 @@ def explained(load: Load | None) -> Iterator[None]:
 
 
 def failed(exit_codes: Mapping[str, int | None]) -> list[str]:
-    """Return the processes that did not end well, but for those cut off while they waited."""
+    """Return the processes that failed, except those that were ended while they waited."""
     return [name for name, code in exit_codes.items() if code not in (0, TOO_BUSY_EXIT_CODE)]
 
 
@@ -199,7 +199,7 @@ class Processes:
         return child
 
     def broken(self) -> str:
-        """Return which child has ended or was stopped, '' if none: no load does that."""
+        """Return the child that has ended or was stopped, '' if none: load is no cause."""
         for name, child in self.children.items():
             if name not in self._ending:
                 if (code := child.poll()) is not None:

@@ -105,8 +105,8 @@ class LiveFlight(Flight):
     """
     A flight of a scenario, in the odom frame without drift; its paths are the true ones.
 
-    An image of the table counts as one with the leader in view if the simulator reports that the
-    leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
+    An image of the table counts as "leader in view" if the simulator reports that the leader can
+    be seen and located. ``log`` is the simulator's, see ``FlightLog``, cut to the
     scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
     """
 
@@ -137,7 +137,7 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
     """
     Return a replayed flight; its time begins with the bag's first image.
 
-    What no node published leaves its figures unknown.
+    A figure is unknown if no node published its data.
 
     :param out: the folder of the record and the log of the embedded autopilot.
     :param params: that it was flown with.
@@ -232,7 +232,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         paths={name: log[f'{name}_position'] for name in (LEADER_NAME, 'follower')},
         speeds={'follower': (log['state_time'] - began, np.linalg.norm(log['velocity'], axis=1)),
                 'leader': (table['time'], np.linalg.norm(log['leader_velocity'], axis=1))},
-        blind=_hidden(table),
+        blind=_hidden_intervals(table),
         distance=log['distance'][flown(log['distance_time'])],
         setpoint_times=log['setpoint_time'][sent] - began,
         setpoints=log['setpoint_acceleration'][sent],
@@ -255,7 +255,7 @@ def _cut(log: dict[str, Any], images: Any, states: Any, clock: Any) -> None:
             log[name] = log[name][states]
 
 
-def _hidden(table: Table) -> list[tuple[float, float]]:
+def _hidden_intervals(table: Table) -> list[tuple[float, float]]:
     """Return the times, s, in which the leader could not be seen, from and to."""
     times, hidden = table['time'], table['visible'] == 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))

@@ -16,8 +16,8 @@
 """
 The results of ``evaluate``, ``demo`` and ``fly``: a table on the console, a page of HTML.
 
-The console names figures by their keys in summary.json, as bounds do; the page in words, with the
-key beside each bound, and in the tooltip of each figure.
+The console prints the keys of the figures in summary.json, as bounds use them. The page prints
+words; each bound and each tooltip has the key.
 """
 
 from __future__ import annotations

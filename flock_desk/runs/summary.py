@@ -257,10 +257,10 @@ def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
         'scenario': flight.scenario.name,
         **common,
         'time_in_band_share': flight.time_in_band_share,
-        'longest_gap_in_view_s': _longest(
+        'longest_gap_in_view_s': _longest_time(
             table['time'], ~np.isfinite(table['distance']) & (table['visible'] == 1.0)),
         'leader_speed_max_m_s': most(leader_speeds),
-        'leader_faster_than_v_max': _longest(
+        'leader_faster_than_v_max': _longest_time(
             times, leader_speeds > 1.001 * params.v_max) >= OUTRUN,
         'altitude_off_m': most(_altitude_off(flight)),
         'planner': {**common['planner'], 'missed_ticks_share': missed, 'warnings': len(warnings),
@@ -328,7 +328,7 @@ def _problems(flight: LiveFlight) -> dict[str, int]:
     return dict(reported.most_common())
 
 
-def _longest(times: Array, holds: Any) -> float:
+def _longest_time(times: Array, holds: Any) -> float:
     """Return the longest time, s, at whose images (n,) something holds, from the one before."""
     longest, since = 0.0, math.inf
     for time, held in zip(times.tolist(), holds.tolist()):

@@ -114,13 +114,13 @@ def course(scenario: Scenario, run: int) -> Course:
     return Course(start + p, v, a, headings)
 
 
-def _smoothed(values: Array, step: float, motion: LeaderMotion) -> Array:
+def _smooth(values: Array, step: float, motion: LeaderMotion) -> Array:
     """Return values (n, ...) that change by at most ``step``, with bounded rate and jerk."""
-    return _averaged(_averaged(values, step / motion.acceleration),
-                     motion.acceleration / motion.jerk)
+    return _average(_average(values, step / motion.acceleration),
+                    motion.acceleration / motion.jerk)
 
 
-def _averaged(values: Array, window: float) -> Array:
+def _average(values: Array, window: float) -> Array:
     """Return values (n, ...), each averaged with those before it in a window, s."""
     width = max(round(window / COURSE_STEP), 1)
     total = np.cumsum(np.concatenate([np.repeat(values[:1], width, axis=0), values]), axis=0)
@@ -137,12 +137,12 @@ def _legs(motion: LeaderMotion, _: float, times: Array, rng: np.random.Generator
     wanted = kept[np.searchsorted(ends, within, side='right')]
     wanted[times == 0.0] = 0.0
     step = float(np.max(np.linalg.norm(np.diff(wanted, axis=0), axis=1)))
-    return _smoothed(wanted, step, motion)
+    return _smooth(wanted, step, motion)
 
 
 def _speed(motion: LeaderMotion, speed: float, times: Array) -> Array:
     """Return the speed (n,) from rest to ``speed``, half of the acceleration left for turning."""
-    return _smoothed(np.where(times > 0.0, speed, 0.0), 2.0 * speed, motion)
+    return _smooth(np.where(times > 0.0, speed, 0.0), 2.0 * speed, motion)
 
 
 def _circle(motion: LeaderMotion, speed: float, times: Array,
@@ -170,7 +170,7 @@ def _wander(motion: LeaderMotion, speed: float, times: Array,
     shares = rng.uniform(0.5, 1.0, (3, 3)) * [1.0, 1.0, 0.15]
     waves = np.sum(shares * np.sin(2.0 * np.pi * times[:, None, None] / periods + phases), axis=1)
     fastest = float(np.max(np.linalg.norm(waves, axis=1)))
-    begin = _smoothed(np.where(times > 0.0, 1.0, 0.0), 3.0 * speed, motion)
+    begin = _smooth(np.where(times > 0.0, 1.0, 0.0), 3.0 * speed, motion)
     return speed * waves / fastest * begin[:, None]
 
 
@@ -217,8 +217,8 @@ def flown(stretches: Iterator[Stretch], motion: LeaderMotion, times: Array) -> A
         drawn.append(next(stretches))
         total += drawn[-1][0]
     legs = np.array(drawn).reshape(-1, 4)
-    level = _ramped(legs[:, 0], legs[:, 1:3], across, times)
-    up = _ramped(legs[:, 0], legs[:, 3:], motion.climb_acceleration, times)
+    level = _ramp(legs[:, 0], legs[:, 1:3], across, times)
+    up = _ramp(legs[:, 0], legs[:, 3:], motion.climb_acceleration, times)
     return np.concatenate([level, up], axis=1)
 
 
@@ -275,7 +275,7 @@ def _walk(steps: Array, most: float) -> Array:
     return np.array(reached)
 
 
-def _ramped(durations: Array, wanted: Array, rate: float, times: Array) -> Array:
+def _ramp(durations: Array, wanted: Array, rate: float, times: Array) -> Array:
     """Return values (n, m) at times (n,), from zero, each wanted one approached at a rate."""
     value, begin = np.zeros(wanted.shape[1]), 0.0
     knots, values = [0.0], [value]
@@ -305,7 +305,7 @@ def _random(stretches: Callable[..., Iterator[Stretch]], motion: LeaderMotion,
             speed: float, times: Array, rng: np.random.Generator) -> Array:
     level = math.sqrt(speed ** 2 - motion.climb ** 2)  # leaves room for the climb
     drawn = stretches(motion.climb, level, _Height(motion), rng)
-    return _averaged(flown(drawn, motion, times), motion.acceleration / motion.jerk)
+    return _average(flown(drawn, motion, times), motion.acceleration / motion.jerk)
 
 
 #: By name: of a motion, its speed and times (n,), s, the velocities (n, 3) from rest.

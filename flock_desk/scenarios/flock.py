@@ -122,7 +122,7 @@ def places(flock: Flock) -> list[Place]:
 
 
 def facing_ahead(places: list[Place]) -> Array:
-    """Return the yaws (n,), rad, with which followers face those ahead of them."""
+    """Return the yaws (n,), rad, with which followers face the vehicles ahead."""
     offsets = [np.zeros(3), *(place.offset for place in places)]
     to = [offsets[place.ahead] - place.offset for place in places]
     return np.array([math.atan2(y, x) for x, y, _ in to])

@@ -15,8 +15,8 @@
 """
 A scenario of a simulated flight: the leader's motion, the wind, the sensors and their failures.
 
-Everything that chance decides in a flight is drawn from a generator of its own, so a run of a
-scenario is the same whichever runs are flown beside it.
+Each random quantity of a flight has its own generator, so a run of a scenario does not depend on
+other runs.
 """
 
 from __future__ import annotations
@@ -354,7 +354,7 @@ class Scenario(Part):
 
     def random(self, run: int, what: str, follower: int = 1) -> np.random.Generator:
         """
-        Return the generator of one thing that chance decides in one run.
+        Return the generator of one random quantity in one run.
 
         :param follower: its number, if each has its own; the first has that of a lone one.
         """

@@ -85,7 +85,7 @@ class Track:
             position, slerp(self.quaternions[i], self.quaternions[i + 1], f))
 
     def velocity(self, time: float) -> Array:
-        """Return how fast it moves, (3,), m/s, in odom at a time within the track, s."""
+        """Return the velocity (3,), m/s, in odom at a time within the track, s."""
         return self._interpolate(self.velocities, time)
 
     def rate(self, time: float) -> Array:
@@ -132,8 +132,8 @@ def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> tuple[Tra
     times = np.arange(round(duration / TRACK_STEP) + 1) * TRACK_STEP
     rng = np.random.default_rng(seed)
     p, v, a, heading = leader_course(times)
-    return (_track(p, v, a, heading, _buffeting(times, rng)),
-            _track(*_follow(p, v, heading, swing), _buffeting(times, rng)))
+    return (_track(p, v, a, heading, _gust_rotations(times, rng)),
+            _track(*_follow(p, v, heading, swing), _gust_rotations(times, rng)))
 
 
 def leader_course(times: Array) -> tuple[Array, Array, Array, Array]:
@@ -174,7 +174,7 @@ def _follow(leader_p: Array, leader_v: Array, headings: Array,
         if i % _PERIOD == 0:
             offset, difference = target_p - p, target_v - v
             wanted = (acceleration([offset], [difference], _FLIGHT) if swing is None else
-                      _keeping(offset, difference, *swing.at(i * TRACK_STEP)))
+                      _keep_distance(offset, difference, *swing.at(i * TRACK_STEP)))
             # The law does not mind where around its leader it flies; the marker is on the tail.
             left = np.array([-np.sin(heading), np.cos(heading), 0.0])
             wanted += left * (left @ (0.3 * offset + 0.2 * difference))
@@ -192,8 +192,8 @@ def _follow(leader_p: Array, leader_v: Array, headings: Array,
     return columns[0], columns[1], columns[2], columns[3]
 
 
-def _keeping(offset: Array, difference: Array, distance: float, rate: float,
-             change: float) -> Array:
+def _keep_distance(offset: Array, difference: Array, distance: float, rate: float,
+                   change: float) -> Array:
     """Return the acceleration (3,), m/s^2, that brings the leader to a distance, and keeps it."""
     horizontal = np.array([offset[0], offset[1], 0.0])
     now = np.sqrt(horizontal @ horizontal)
@@ -223,7 +223,7 @@ def attitude(specific_force: ArrayLike, yaw: float) -> Array:
     return matrix_to_quaternion(np.stack([np.cross(y, z), y, z], axis=1))
 
 
-def _buffeting(times: Array, rng: np.random.Generator) -> Array:
+def _gust_rotations(times: Array, rng: np.random.Generator) -> Array:
     """Return small rotation vectors (N, 3), rad: gusts and the attitude loops' response."""
     total = np.zeros((len(times), 3))
     for frequency in (1.3, 2.9, 5.3, 9.7):  # Hz

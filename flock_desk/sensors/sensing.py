@@ -34,7 +34,7 @@ DIRECTIONS = {'front': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'back'
 
 
 def _camera_axes(direction: tuple[int, int, int]) -> tuple[Array, Array, Array]:
-    """Return where a camera looks, and its left and its top, on the body (3,) each."""
+    """Return the forward, left and up axes of a camera on the body, (3,) each."""
     axis = np.array(direction, dtype=float)
     up = np.array([-axis[2], 0.0, 1.0 - abs(axis[2])])
     return axis, np.cross(up, axis), up
@@ -68,7 +68,7 @@ class PerceptionNoise:
     nearest: float = 0.3
     """Nearest distance at which a marker fits the image, m."""
     farthest: float = math.inf
-    """Farthest at which it is found, m."""
+    """Farthest distance at which the marker is detected, m."""
 
 
 def relative_noise(offsets: Array, noise: PerceptionNoise, turning: ArrayLike = 0.0) -> Array:

@@ -72,7 +72,7 @@ class Px4(FlightController):
         self._ramp = -1.0 if self.on_ground else 1.0
 
     def conditions(self, now: float) -> dict[str, bool]:
-        """Return those of all autopilots, a setpoint that is not too old, and a transmitter."""
+        """Return the conditions of all autopilots, a recent setpoint, and a transmitter."""
         return {**super().conditions(now), 'sticks': self._sticks,
                 'stream': now - self._setpoint_time <= self.parameters['COM_OF_LOSS_T']}
 

@@ -60,7 +60,7 @@ class Quadrotor:
         self.position: Array = np.array(position, dtype=float)
         self.velocity: Array = np.zeros_like(self.position)
         self.acceleration: Array = np.zeros_like(self.position)
-        self.yaw: Any = _wrapped(np.asarray(yaw, dtype=float))
+        self.yaw: Any = _wrap_angles(np.asarray(yaw, dtype=float))
         self.axis: Array = np.zeros_like(self.position) + _UP_ENU
         """The body's z axis in ENU."""
         self.thrust: Any = np.where(self.position[..., 2] > 0.0, GRAVITY, 0.0)
@@ -105,7 +105,7 @@ class Quadrotor:
 
     def step(self, dt: float, *, powered: bool = True, wind: ArrayLike = 0.0) -> None:
         """
-        Move on by ``dt``, s.
+        Advance the motion by ``dt``, s.
 
         :param powered: False stops the motors.
         :param wind: velocity of the air (..., 3), m/s, ENU.
@@ -122,10 +122,10 @@ class Quadrotor:
             -dt / THRUST_TIME)
         self.axis = _turn(self.axis, tilt, -math.expm1(-dt / ATTITUDE_TIME))
         rate = np.minimum(np.maximum(
-            YAW_GAIN * _wrapped(yaw - self.yaw),
+            YAW_GAIN * _wrap_angles(yaw - self.yaw),
             -YAW_RATE_MAX), YAW_RATE_MAX)
         turn = rate * dt
-        self.yaw = _wrapped(self.yaw + (np.where(landed, 0.0, turn) if on_ground else turn))
+        self.yaw = _wrap_angles(self.yaw + (np.where(landed, 0.0, turn) if on_ground else turn))
         self._move(dt, powered, landed if on_ground else None, np.asarray(wind, dtype=float))
 
     def _nominal(self, acceleration: Array) -> tuple[Array, Array]:
@@ -198,6 +198,6 @@ def _turn(axis: Array, target: Array, fraction: float) -> Array:
     return turned / np.sqrt(np.add.reduce(turned * turned, axis=-1, keepdims=True))
 
 
-def _wrapped(angle: Any) -> Any:
+def _wrap_angles(angle: Any) -> Any:
     """Return angles, rad, in [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi

@@ -15,11 +15,11 @@
 """
 Read bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
 
-Whatever the format, a reader gets ROS 2 Jazzy types serialized as CDR. ROS 2 messages pass
+For every format, a reader returns ROS 2 Jazzy types serialized as CDR. ROS 2 messages pass
 through undecoded; ROS 1 messages are migrated (``Header.seq`` dropped, ``time`` and ``duration``
 to ``builtin_interfaces``, fields in lower case, as ``CameraInfo``'s D, K, R, P).
-Every failure is a :class:`BagError` whose message is one line. Damage inside a message shows only
-where the format carries a checksum: MCAP chunks (always in the bags written here) and ROS 1
+Every failure is a :class:`BagError` whose message is one line. Damage inside a message is detected
+only if the format has a checksum: MCAP chunks (always in the bags written here) and ROS 1
 chunks compressed with bz2.
 """
 
@@ -128,9 +128,10 @@ class Bag(AbstractContextManager['Bag']):
     @property
     def set_back_ns(self) -> int:
         """
-        Return by how much the clock was set back while a file was recorded, ns; about 0 if not.
+        Return by how much the clock was set back during the recording, ns, else about 0.
 
-        Messages come in the order of their times: those before and after such a step are mixed.
+        Messages are returned in the order of their times: those before and after the step are
+        mixed.
         """
         if isinstance(self._reader, SequentialReader):
             return self._reader.disorder
@@ -201,8 +202,8 @@ def open_bag(path: str | Path) -> Bag:
     """
     Open a ROS 1 ``.bag``, a ROS 2 bag directory, or a bare ``.mcap`` or ``.db3`` file.
 
-    A file that rosbags refuses, or cannot read to the last message, is read from start to end;
-    one in MCAP that was never finished is read as far as it goes, see ``Bag.incomplete``.
+    If rosbags refuses a file, or cannot read its last message, the file is read sequentially. An
+    unfinished MCAP file is read up to its last whole chunk, see ``Bag.incomplete``.
 
     :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
     """
@@ -265,7 +266,7 @@ def _storages(reader: Reader) -> list[Any]:
 
 
 def _is_indexed(storage: Any) -> bool:
-    """Return whether a file's index leads to every message, each with its type."""
+    """Return whether a file's index lists every message and its type."""
     if not isinstance(storage, McapReader):
         return True
     indexed = sum(sum(chunk.channel_count.values()) for chunk in storage.chunks)
@@ -297,7 +298,7 @@ def failures(subject: str | Path, what: str) -> Iterator[None]:
 
 
 def absolute(topic: str) -> str:
-    """Return the name of a topic with a slash before it, and none after it."""
+    """Return the name of a topic with one leading slash and no trailing slash."""
     return f'/{topic.strip("/")}'
 
 
@@ -309,7 +310,7 @@ def _is_latched(connection: Connection) -> bool:
 
 
 def _unreadable(connections: list[Connection]) -> str | None:
-    """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
+    """Return why the messages of one topic cannot be returned as ROS 2 CDR, or None."""
     msgtypes = sorted({c.msgtype for c in connections})
     if len(msgtypes) > 1:
         return f'several types on one topic ({", ".join(msgtypes)})'

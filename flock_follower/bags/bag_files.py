@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The files of a ROS 2 bag, and what it lacks.
+The files of a ROS 2 bag, and the reason if the bag is incomplete.
 
-A folder's ``metadata.yaml`` names its files; without it, all files of one storage are taken. Their
-content is described by themselves.
+A folder's ``metadata.yaml`` names its files; without it, all files of one storage format are used.
+The files describe their own content.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The present state in one line: a terminal shows it in place, a log gets one now and then."""
+"""The current state as one line: overwritten on a terminal, repeated at intervals in a log."""
 
 from __future__ import annotations
 

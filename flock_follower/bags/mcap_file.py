@@ -173,7 +173,7 @@ class McapFile:
         self.size += len(data)
 
     def _introduce(self, topic: RecordedTopic, content: bytearray) -> int:
-        """Describe a topic and its type in a chunk; return the number of its channel."""
+        """Write the description of a topic and its type to a chunk; return the channel number."""
         number = self._channels[topic] = len(self._channels) + 1
         qos = _text('offered_qos_profiles') + _text(json.dumps(topic.qos))
         source = _text('source') + _text(topic.source) if topic.source else b''
@@ -244,7 +244,7 @@ def mark_incomplete(folder: Path) -> None:
 
 
 def incomplete(path: Path) -> str:
-    """Return why a bag, its folder or the file in it, was not finished; '' if it was."""
+    """Return why a bag (a folder, or a file in it) is unfinished; '' if it is finished."""
     folder = path if path.is_dir() else path.parent
     return _UNFINISHED if (folder / MARK).exists() else ''
 

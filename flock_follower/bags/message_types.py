@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Message types of ROS 2 Jazzy without ROS, and the conversion of those of ROS 1."""
+"""Message types of ROS 2 Jazzy without ROS, and the conversion of ROS 1 types."""
 
 from __future__ import annotations
 

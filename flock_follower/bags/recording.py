@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Recordings in flight: one folder each, in files of limited size, of which the oldest make way.
+Recordings in flight: one folder each, in files of limited size; the oldest files are deleted.
 
 Each recording is a ROS 2 bag of several MCAP files. The data is on the disk when ``write``
 returns. Text files lie beside them, see ``note``.
@@ -55,11 +55,11 @@ KEPT = 15  # the newest files, which are never deleted: at 1.5 MB/s the last 10 
 
 class FlightRecording:
     """
-    The recordings in a folder, and the current one, which begins with the first message.
+    The recordings in a folder, and the current recording, which begins with the first message.
 
     :param folder: for the recordings of one vehicle; created if missing.
-    :param disk_used: what all recordings may take of the disk, MB.
-    :param disk_free: what stays free on it, MB.
+    :param disk_used: largest size of all recordings, MB.
+    :param disk_free: space that stays free on the disk, MB.
     :raises OSError: it cannot be made, or another process records there.
     """
 
@@ -89,7 +89,7 @@ class FlightRecording:
 
     def write(self, messages: Sequence[TakenMessage], now: float) -> None:
         """
-        Write messages and have them on the disk.
+        Write messages, and return once the disk holds them.
 
         :param now: s of a monotonic clock.
         :raises OSError: if that fails; none of the messages is kept then, the file is
@@ -172,9 +172,9 @@ class FlightRecording:
 
     def _make_room(self) -> None:
         """
-        Delete the oldest files if recordings take too much, or little of the disk is free.
+        Delete the oldest files if the recordings are too large or the disk is nearly full.
 
-        :raises OSError: too little is free, and there is nothing more to delete.
+        :raises OSError: the disk is full, and there is no file left to delete.
         """
         files = [file for path in self._recordings() for file in mcap_files(path)]
         sizes = [file.stat().st_size for file in files]
@@ -190,7 +190,11 @@ class FlightRecording:
             raise OSError(errno.ENOSPC, f'less than {self._disk_free:.0f} MB free')
 
     def _delete(self, file: Path) -> None:
-        """Delete a file, and its recording with the last one; the rest is an incomplete bag."""
+        """
+        Delete a file, and with its last file the recording.
+
+        The remaining files are an incomplete bag.
+        """
         file.unlink()
         if file.parent != self.path:
             (file.parent / METADATA).unlink(missing_ok=True)
@@ -217,7 +221,7 @@ def _lock_folder(folder: Path) -> int:
 
 
 def _sync(folder: Path) -> None:
-    """Have the names of the files in a folder on the disk."""
+    """Write the directory entries of a folder to the disk (fsync)."""
     opened = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(opened)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The schedule of playback: when each message of a bag falls due, without ROS or a clock.
+The schedule of playback: the time at which each message of a bag is published. No clock is read.
 
 Wall time is float seconds of any monotonic clock and always passed in; bag time is integer
 nanoseconds.
@@ -59,7 +59,7 @@ class Gaps:
         self._last_ns = start_ns
 
     def take(self, stamp_ns: int) -> float:
-        """Return the step before a message, s, negative if the clock went back; 0: no gap."""
+        """Return the gap before a message, s; negative if the clock went back; 0 without a gap."""
         step_ns = 0 if self._last_ns is None else stamp_ns - self._last_ns
         self._last_ns = stamp_ns
         if abs(step_ns) <= MAX_GAP * NS_PER_S:
@@ -96,20 +96,20 @@ class Timeline:
         return self._wall + (stamp_ns - self._bag_ns) / (self.rate * NS_PER_S)
 
     def change(self, now: float, rate: float, paused: bool) -> None:
-        """Go on from the position of ``now``, at another rate, or pause there."""
+        """Continue at another rate from the position at ``now``, or pause there."""
         self.jump(self.position(now), now)
         self.rate, self.paused = rate, paused
 
     def jump(self, stamp_ns: int, now: float) -> None:
-        """Be at bag time ``stamp_ns`` at wall time ``now``."""
+        """Set the position to bag time ``stamp_ns`` at wall time ``now``."""
         self._bag_ns, self._wall = stamp_ns, now
 
     def limit_lateness(self, stamp_ns: int, now: float, limit: float) -> None:
         """
         Drop the backlog when a stamp is late by more than ``limit`` s.
 
-        After a suspended process or a stalled disk, playback goes on at its rate instead of
-        flooding its subscribers with everything missed.
+        After the process was suspended or the disk stalled, playback continues at its rate, and
+        does not publish all delayed messages at once.
         """
         if now - self.due(stamp_ns) > limit:
             self.jump(stamp_ns, now)

@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-Reading ROS 2 recordings from start to end, without their indexes, changing nothing.
+Sequential reader of ROS 2 recordings: needs no index, and changes no file.
 
 rosbags needs a file's end and its index, and a folder's ``metadata.yaml``, and refuses a file for
 one channel that is not of ROS 2. This reader needs none of them: it takes the files one after the
-other, one in MCAP without an end up to its last good chunk. Their content is all that it goes by.
-MCAP files are read by the library mcap; on a vehicle it need not be installed.
+other, one in MCAP without an end up to its last good chunk. The reader uses only the files'
+content. MCAP files are read by the library mcap; on a vehicle it need not be installed.
 """
 
 from __future__ import annotations
@@ -81,10 +81,10 @@ class SequentialReader:
 
     def open(self) -> None:
         """
-        Look through the files; those that hold nothing are left out.
+        Scan the files, and omit empty files.
 
-        :raises ValueError: all of them hold nothing, one holds less than it announces,
-            messages are compressed one by one, or the library mcap is not installed.
+        :raises ValueError: all files are empty, a file holds fewer messages than its index states,
+            messages are compressed individually, or the library mcap is not installed.
         """
         counts: Counter[_Channel] = Counter()
         for file in self._files:

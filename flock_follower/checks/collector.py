@@ -154,7 +154,7 @@ class Collector:
             self._kept.append((picture, pixels))
 
     def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
-        """Measure the shift since the image before, if the time between them suits."""
+        """Measure the shift since the previous image, if the time between both is suitable."""
         reduced, before = small(pixels), self._small
         if before is not None and stamp - before[0] < PAIR[0]:
             return  # the next one is further off
@@ -219,9 +219,10 @@ class Collector:
                  found: Detections, config: NeighborConfig, up: Array | None
                  ) -> list[list[float]]:
         """
-        Enter the markers found in a picture; return their rows of ``sightings``.
+        Record the markers that are found in an image; return their rows of ``sightings``.
 
-        :param camera: None if unknown: then every outline counts as a marker.
+        :param camera: None if unknown: then each quadrilateral with a valid code counts as a
+            marker.
         :param up: (3,), the upward direction in the camera's axes; None if unknown.
         """
         rows, by_marker = [], config.by_marker()

@@ -74,7 +74,7 @@ def grade(bad: bool, poor: bool, what: str, measured: str, wanted: str,
 
 def first(what: str, wanted: str, *cases: tuple[Any, str, str, str]) -> Finding:
     """
-    Return the finding of the first case that holds; one of them must.
+    Return the finding of the first case whose condition is true; one condition must be true.
 
     :param cases: whether it holds, the level, the value measured, and the advice, '' if OK.
     """
@@ -83,7 +83,7 @@ def first(what: str, wanted: str, *cases: tuple[Any, str, str, str]) -> Finding:
 
 
 def without_consequences(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the findings without those that only follow from another one."""
+    """Return the findings without those that only result from another finding."""
     findings = list(findings)
     faulty = {finding.what for finding in findings if finding.level == ERROR}
     return [finding for finding in findings if not faulty.intersection(

@@ -86,7 +86,7 @@ MAX_GAP = 0.3
 
 
 class OwnPath:
-    """The own motion between the states of an odometry, in order."""
+    """The ego motion by the states of an odometry, in the order of their stamps."""
 
     def __init__(self, states: Sequence[OdometryState]) -> None:
         quaternions = np.array([state.quaternion for state in states])
@@ -98,7 +98,7 @@ class OwnPath:
 
     @cached_property
     def _motion(self) -> Array:
-        """Return positions and velocities in base_link (n, 6); attitudes alone need neither."""
+        """Return positions, m, and velocities in base_link, m/s, as rows (n, 6)."""
         return np.array([
             [*state.position, *(state.velocity @ quaternion_to_matrix(state.quaternion))]
             for state in self._states])
@@ -132,7 +132,7 @@ def small(image: GrayImage) -> Array:
 
 def shift(before: Array, after: Array, width: int) -> Array:
     """
-    Return how each part of the scene moved right and down, px of images of that width.
+    Return the shift of each part of the image right and down, px at ``COMPARED_WIDTH``.
 
     (PARTS, 3), the last column is the quality. A large shift of two windows at the same place is
     measured too small, so they are compared again with windows that are that far apart.
@@ -182,7 +182,7 @@ class AxesFit(NamedTuple):
 def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraModel,
              R_base_optical: Array, up: Array | None = None) -> AxesFit | None:
     """
-    Return how the axes fit, or None if the images hardly moved.
+    Return the fit of the axes, or None if the images hardly moved.
 
     :param shifts: rows of stamp before, stamp after, and the numbers of :func:`shift`.
     :param up: (3,), the upward direction in base_link as configured: besides the identity only

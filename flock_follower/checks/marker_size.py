@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The size of a marker at rest, by one ratio: the change of the distance seen to the way moved.
+The size of a marker at rest, from the ratio of the change of distance to the camera's path.
 
 By odometry and image the marker must stay in place. If it approaches by more, or less, than the
 camera moves towards it, its size (or the focal length) is wrong. Both are taken along the mean
@@ -70,7 +70,7 @@ HOW: Final = 'stand the leader on the ground, and move the camera 1 m towards it
 
 class Ratio(NamedTuple):
     """
-    Ratio of the changes of the seen distance to those of the true one, and its deviation.
+    Ratio of the changes of the measured distance to the true changes, and its standard deviation.
 
     ``moved``: RMS way of the camera, m; ``left``: RMS of the changes that remain, m.
     """

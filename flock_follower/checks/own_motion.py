@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The odometry: its velocity, jumps and axes; the images and the mounting compared with it."""
+"""Checks of the odometry (velocity, jumps, axes), and of images and mounting against it."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ DERIVED: Final = 'works: derived from the positions, which is noisier'
 
 
 def check_own_motion(seen: Observations) -> Iterator[Finding]:
-    """Check the odometry, and by it the images and the marker."""
+    """Check the odometry, then the images and the marker against the odometry."""
     motion = seen.own
     if motion is None:
         return
@@ -166,8 +166,8 @@ def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
     """
     Check that the positions have the axes of attitude and velocity; ``height`` is their z, m.
 
-    They have others if a rotation, or a reflection, of the velocity explains them, and neither
-    reading of the velocity does without it (Kabsch's method).
+    The axes differ if only a rotated or reflected velocity explains the positions, in the child
+    frame and in the header's frame (Kabsch's method).
     """
     if twist.wanted == NONE or len(twist.windows) < MIN_WINDOWS or not np.any(
             np.array(twist.windows)[:, 1]):

@@ -40,7 +40,7 @@ SELDOM: Final = 0.5
 
 def camera_model(seen: Observations) -> CameraModel:
     """
-    Return the camera of the newest CameraInfo, as relative_pose has it.
+    Return the camera of the newest CameraInfo, as relative_pose reads it.
 
     :raises ValueError: there is no calibration, or it is wrong.
     """

@@ -13,14 +13,14 @@
 # limitations under the License.
 
 """
-Whether the machine was too busy: the time for which processes waited for a processor.
+Whether the machine was too busy: measures how long processes waited for a processor.
 
 The kernel counts for each thread the time for which it ran, and for which it was ready and waited
 (``/proc/PID/task/TID/schedstat``). Processes that work together also wait for each other, on a
-quiet machine, too. So that part of their waiting counts for which other programs had the
-processors (``/proc/stat``). A process of ours that has ended has no file any more: what it ran is
-known from its parent (``getrusage``). The files are there in a container. Without them the load is
-unknown, and an unknown load excuses nothing.
+quiet machine, too. So only the share of the waiting counts that other programs caused
+(``/proc/stat``). A process of ours that has ended has no file any more: its parent knows its
+processor time (``getrusage``). The files are there in a container. Without these files the load is
+unknown, and with an unknown load every bound is judged.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Load(NamedTuple):
 
     @property
     def busy(self) -> bool:
-        """Return whether the load makes the times measured meanwhile useless."""
+        """Return whether the load was too high to judge the times measured meanwhile."""
         return self.share > BUSY_SHARE
 
     def __str__(self) -> str:
@@ -153,7 +153,7 @@ def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
 
 
 def load_between(before: Counters, after: Counters, processors: int) -> Load:
-    """Return the load between two readings; a thread that is only in the second one is new."""
+    """Return the load between two readings; a thread that only the second reading has is new."""
     ran, waited = (1e-9 * sum(counted[k] - before.threads.get(path, (0, 0))[k]
                               for path, counted in after.threads.items()) for k in (0, 1))
     used = max(after.machine - before.machine, 0.0)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From where ROS is reached in a process: read from its sockets, as the kernel lists them."""
+"""Which computers can reach the ROS of a process: read from the process's sockets in /proc."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PORTS_PER_DOMAIN: Final = 250
 
 
 class Reach(Enum):
-    """From where a node is reached; each includes those before it."""
+    """The computers that can reach a node; each value includes the values before it."""
 
     COMPUTER = 'this computer'
     ADDRESS = 'computers that name the address of this one as a peer'
@@ -41,7 +41,7 @@ class Reach(Enum):
 
 def find_reach(process: int, domain: int, proc: Path = Path('/proc')) -> Reach | None:
     """
-    Return from where the ROS of a process is reached; None if no socket of ROS is found.
+    Return which computers can reach the ROS of a process; None if no socket of ROS is found.
 
     A socket that is bound to the loopback interface is reached from this computer. So is one that
     is bound to a multicast address: a computer elsewhere gets no answer from it. Firewalls are

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""All checks, of a running system or of a bag, whose observations are the same."""
+"""All checks; observations of a running system and of a bag have the same form."""
 
 from __future__ import annotations
 
@@ -119,13 +119,13 @@ class RecordedSystem:
                         and bag.topics[full].msgtype in POSE_TYPES and full not in self.topics}
 
     def is_long_enough(self, time_ns: int) -> bool:
-        """Return whether what comes at a time, ns, is not checked any more."""
+        """Return whether messages from a time, ns, on are not checked any more."""
         return time_ns - self._start_ns - self._gaps.skipped_ns >= MAX_DURATION * NANOSECONDS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes, message: Any = None
              ) -> Any:
         """
-        Take a message; one of another topic, or one that comes too late, is ignored.
+        Take a message; messages of other topics, and messages after the checked time, are ignored.
 
         Return its fields if they were read. If the bytes are no message of the type, the bag is
         reported as incomplete.

@@ -18,7 +18,8 @@ Alignment of the odometry frame of another vehicle with the own frame, by a Kalm
 All frames share the vertical, by gravity: a frame has a yaw and a translation, 4 unknowns. The
 state is the yaw, which turns its coordinates to the own ones, and the place of an anchor point in
 the own frame. The anchor moves with the sending vehicle, because the drift of its odometry turns
-the frame about the vehicle. So yaw and place are nearly independent, and the lever is short.
+the frame about the vehicle. So the errors of yaw and place are nearly independent, and the lever
+arm is short.
 
 The first estimate is a least-squares fit of the positions of common vehicles in two frames. The
 best yaw between two sets of points is the direction of a sum that is linear in cosine and sine,
@@ -118,7 +119,11 @@ class Frame:
         self.covariance = J.dot(self.covariance).dot(J.T)
 
     def drift(self, stamp: int, own_position: Array) -> None:
-        """Let both frames drift until a stamp, ns; the own one turns about a position (3,)."""
+        """
+        Add the drift of both frames until a stamp, ns.
+
+        The ego frame rotates about a position (3,).
+        """
         elapsed = max(stamp - self.stamp, 0) / NANOSECONDS
         self.stamp = max(stamp, self.stamp)
         about = np.array([1.0, *yaw_derivative(self.place - own_position)])
@@ -131,7 +136,7 @@ class Frame:
         """
         Update with the track points of one vehicle in its frame and in the own one, at one stamp.
 
-        Return the squared Mahalanobis distance of the two over the gate's: above 1 it is refused.
+        Return their squared Mahalanobis distance divided by the gate's: above 1 it is refused.
         """
         rotation, lever = yaw_rotation(self.yaw), self.lever(theirs.position)
         H, noise = _jacobian(lever), np.zeros((4, 4))

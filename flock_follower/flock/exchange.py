@@ -237,7 +237,7 @@ class Sharing:
     def _relating_point(self, vehicle: str, stamp: int, of: Sender
                         ) -> tuple[TrackPoint | None, float]:
         """
-        Return a vehicle at a stamp in the own frame, and the hops of a relation by it.
+        Return a vehicle at a stamp in the ego frame, and the hops of a relation by this vehicle.
 
         :param of: the sender to relate.
         """
@@ -255,7 +255,7 @@ class Sharing:
         return None, math.inf
 
     def _relate_seen(self, name: str, ours: TrackPoint, hops: float) -> None:
-        """Relate the frame of a vehicle that was seen: its own states are newer than an image."""
+        """Relate the frame of a vehicle in view; its own states are newer than the image."""
         if sender := self._senders.get(name):
             self._relate(sender, name, sender.tracks[name].point_at(ours.stamp), ours, hops)
 

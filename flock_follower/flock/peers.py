@@ -15,8 +15,8 @@
 """
 States that vehicles send: names, validity, tracks of vehicles, leaps of odometry, prediction.
 
-A message received before its stamp is from a clock that is ahead by at least as much. A clock that
-is behind looks like a slow link.
+If a message is received before its stamp, the sender's clock is ahead by at least this difference.
+A clock that is behind has the same effect as a slow link.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ Kept = TypeVar('Kept')
 
 
 def in_order(by_name: dict[str, Kept]) -> list[Kept]:
-    """Return values in the order of their names, not in that in which they came."""
+    """Return values in the order of their names, independent of the order of their arrival."""
     return [by_name[name] for name in sorted(by_name)]
 
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A vehicle that sends messages: its messages, and the relation of its frame to the own one."""
+"""A vehicle that sends messages: its messages, and the relation of its frame to the ego frame."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Sender:
 
     @property
     def slow(self) -> str:
-        """Return a warning if all last messages of the sender were old on reception, or ''."""
+        """Return a warning if all recent messages of the sender were old on arrival, or ''."""
         least = min(self.ages, default=0.0)
         return '' if least < SLOW_LINK else (
             f'messages are {least:.2f} s old or more: a slow way, or its clock is behind')

@@ -13,7 +13,9 @@
 # limitations under the License.
 
 """
-The gate: what may be sent, whatever anybody asks. ENU; it knows nothing of MAVLink.
+The gate decides which setpoints may be sent, independent of the commands.
+
+ENU; it knows nothing of MAVLink.
 
 The planner is imported for its limits, which the gate applies again.
 """

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The disturbance: the acceleration that nobody commanded, by a wrong hover thrust and by wind.
+The disturbance: acceleration that was not commanded, from a wrong hover thrust and wind.
 
 An autopilot flies an acceleration setpoint by a tilt and a thrust that depend on the setpoint
 alone. PX4 does not compare the result with the setpoint: in wind the vehicle drifts, and with a
@@ -23,7 +23,8 @@ stays small. The gate alone offsets the disturbance, beside the command.
 ``DisturbanceObserver`` is a Luenberger observer with the states velocity and disturbance, both
 poles of an axis at -w (BANDWIDTH): v' = response + d + 2 w (v_measured - v),
 d' = w^2 (v_measured - v).
-``HeightWatch`` finds a height that leaves the commanded one, whatever the estimate is.
+``HeightWatch`` detects a height that departs from the commanded height, independent of the
+estimate.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ HEIGHT_LEFT: Final[float] = 0.2
 
 
 class HeightWatch:
-    """Finds a height that leaves the commanded one: a thrust that the estimate does not show."""
+    """Detects a height that departs from the commanded height: an unestimated thrust error."""
 
     def __init__(self) -> None:
         self.reason = ''
@@ -144,7 +145,7 @@ class HeightWatch:
         """
         Compare the height with the commanded one, m; None if either is unknown.
 
-        A commanded height that moves away from the vehicle is no fault of the vehicle.
+        If the commanded height moves away from the vehicle, the difference does not count.
         """
         self.reason = ''
         if height is None or commanded is None or not math.isfinite(height - commanded):

@@ -160,7 +160,7 @@ def approach_speed(distance: float, deceleration: float) -> float:
 def vertical_range(limits: GateLimits, place: Location, climb_rate: float, horizon: float,
                    a_max: float) -> tuple[float, float]:
     """
-    Return the least and the greatest vertical acceleration, m/s^2, by the heights.
+    Return the least and greatest vertical acceleration, m/s^2, that the height bounds permit.
 
     :param climb_rate: by the odometry, m/s: the rate that is worse for a bound counts.
     :param horizon: time in which the speed is to be reached, s.
@@ -177,7 +177,7 @@ def vertical_range(limits: GateLimits, place: Location, climb_rate: float, horiz
 
 def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float) -> Side | None:
     """
-    Return the bound of the horizontal acceleration, m/s^2, by ``radius_max``; None far from it.
+    Return the bound of the horizontal acceleration, m/s^2, near ``radius_max``, else None.
 
     :param velocity: (3,), m/s.
     :param horizon: time in which the speed is to be reached, s.
@@ -341,7 +341,7 @@ class HeightEstimator:
         return (self._reported or 0.0) + self._velocity_error
 
     def correct(self, climb_rate: float, now: float) -> float:
-        """Return a vertical velocity by the other source, m/s, less at most MAX_CORRECTION."""
+        """Return a vertical velocity of odometry, m/s, corrected by at most MAX_CORRECTION."""
         known = self._reported is not None and now - self._time <= HEIGHT_TIMEOUT
         error = min(max(self._velocity_error, -MAX_CORRECTION), MAX_CORRECTION)
         return climb_rate + (error if known else 0.0)
@@ -364,17 +364,17 @@ class HeightEstimator:
         return self._reference is not None
 
     def refer(self, height: float | None, now: float) -> None:
-        """Take the present height, m, as known; None forgets the reference."""
+        """Set the reference so that the present height is the given one, m; None forgets it."""
         altitude = self.altitude(now)
         self._reference = None if height is None or altitude is None else altitude - height
         self._referred = self.has_reference
 
     def is_missing(self, now: float) -> bool:
-        """Return whether a height that was known is not received any more."""
+        """Return whether the height was known before and is not received any more."""
         return self._referred and self.height(now) is None
 
     def obstacle(self, now: float) -> Obstacle | None:
-        """Return why a height that was known cannot be used at ``now``, or None."""
+        """Return why a height that was known before cannot be used at ``now``, or None."""
         if self.is_missing(now):
             return Obstacle.HEIGHT_STALE
         jumped = self._reference is not None and now - self.stepped < STEP_PAUSE

@@ -117,7 +117,7 @@ NO_HANDOVER: Final[Handover] = Handover()
 
 
 class FlightEnd:
-    """Follows one bridge's flights; times are monotonic, s."""
+    """Tracks the flights of one bridge, and requests their end; times are monotonic, s."""
 
     def __init__(self, params: EndParams | None = None) -> None:
         self.params = params or EndParams()
@@ -135,13 +135,13 @@ class FlightEnd:
         self._low_since = min(self._low_since, now) if low else math.inf
 
     def battery_low(self, now: float) -> str:
-        """Return that the battery has been low for long enough, or ''."""
+        """Return the reason if the battery has been low for long enough, or ''."""
         return '' if now - self._low_since < BATTERY_TIME else (
             f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
             f'{100.0 * self.params.battery_low:.0f} %')
 
     def battery_unknown(self, now: float) -> bool:
-        """Return whether ``battery_low`` cannot act, because the battery is not known."""
+        """Return whether the battery is unknown, so that ``battery_low`` cannot act."""
         remaining, time = self._battery
         return self.params.battery_low > 0.0 and (
             math.isnan(remaining) or now - time > BATTERY_TIMEOUT)
@@ -152,7 +152,7 @@ class FlightEnd:
 
     @property
     def why(self) -> str:
-        """Return why the bridge has handed over since offboard was last requested, or ''."""
+        """Return why the bridge has handed over since the last request of offboard, or ''."""
         return self.handover.why
 
     def reason(self, active_since: float, command_time: float, handover: str,
@@ -204,5 +204,5 @@ class FlightEnd:
         return ''
 
     def _keep_hold(self) -> None:
-        """Request no landing any more."""
+        """Cancel the landing that would follow the hold mode."""
         self.handover = self.handover._replace(action=HOLD)

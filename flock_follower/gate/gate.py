@@ -87,7 +87,7 @@ class ReportedFlight:
     active_since: float = math.inf
     """Time from which it has been ACTIVE, s."""
     landed_since: float = math.inf
-    """Time from which it has reported that it stands, low, s."""
+    """Time since which it has reported "landed" at a low height, s."""
     heightless_since: float = math.inf
     """Time from which its height has been missing, s."""
 
@@ -99,7 +99,7 @@ class ReportedFlight:
 
 @dataclass
 class Flown:
-    """What was sent last, and what braking keeps; None: unknown, or none."""
+    """The last setpoint, and the values that braking holds; None: unknown, or none."""
 
     acceleration: Array | None = None
     """(3,), m/s^2, if the vehicle flies it."""
@@ -222,7 +222,7 @@ class Gate:
         return refused
 
     def corrected_climb_rate(self, climb_rate: float, now: float) -> float:
-        """Return a vertical velocity of odom, m/s, less the error that the barometer shows."""
+        """Return a vertical velocity of odom, m/s, minus its error by the barometer."""
         by_odom = self.motion.source == ODOM
         return self.heights.correct(climb_rate, now) if by_odom else climb_rate
 
@@ -255,7 +255,7 @@ class Gate:
         return float(self._disturbance.offset(False)[2])
 
     def thrust_error(self, now: float, longer: float = disturbance.WARNING_TIME) -> str:
-        """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
+        """Return the reason if the thrust error has been too large for over a time, s, or ''."""
         return '' if now - self._disturbance.excess_since <= longer else (
             f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
             f'more than setpoints offset ({THRUST_OFFSET_MAX:g}): check the load, the '
@@ -295,8 +295,9 @@ class Gate:
         """
         Return the setpoint to send at ``now``, s, and its command, if any.
 
-        Once the vehicle flies our setpoints, yaw and height to hold are frozen where braking
-        begins, and the radius counts from there; before, they follow the vehicle.
+        Once the vehicle flies our setpoints, the yaw and height to hold are those at the beginning
+        of braking, and the radius counts from the position at ACTIVE. Before, these values follow
+        the vehicle.
 
         :param link_age: time since the autopilot is missing, s.
         :param withheld: a reason of the caller's own to send nothing.
@@ -347,7 +348,7 @@ class Gate:
         return situation
 
     def _record(self, situation: Situation, setpoint: Setpoint, engaged: bool) -> None:
-        """Store what was decided; end the permission of a vehicle that has become blind."""
+        """Store the decision; end the permission if no velocity is known any more."""
         flown, report, now = self._flown, situation.report, situation.now
         sends = setpoint.kind != setpoint_rules.NONE
         active = self.permission.phase is Phase.ACTIVE
@@ -385,11 +386,11 @@ class Gate:
             place.height + situation.command.command.altitude - altitude)
 
     def _within_heights(self, height: float) -> float:
-        """Return the height, m, within the envelope that is nearest to one."""
+        """Return a height, m, clipped to the envelope."""
         return min(max(height, self.limits.height_min), self.limits.height_max)
 
     def _retreat(self, known: KnownMotion, now: float) -> Array | None:
-        """Return the velocity (3,), m/s, to brake to, if odometry is lost and a neighbor came."""
+        """Return the retreat velocity (3,), m/s, if odometry is lost and a neighbor approached."""
         command, lost_since = self.commands.newest, self.motion.odometry.velocity_time
         lost = known.source == ODOM and known.velocity is None and not known.contradiction
         # The planner outlived the odometry, so the odometry ended the commands.

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The limits of an acceleration whose vertical part comes first."""
+"""The limits of an acceleration whose vertical part has priority."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from flock_follower.planner.projection import Discs, nearest_in_order, Side
 def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: float, v_max: float,
                 period: float) -> Array:
     """
-    Return the acceleration (3,) within the limits whose vertical part comes first.
+    Return the acceleration (3,) within the limits; its vertical part has priority.
 
     The vertical part is ``up``, m/s^2, or as near to it as both limits allow. The horizontal part
     is the nearest one to that of ``a`` in the discs that this level cuts out of the limits and,

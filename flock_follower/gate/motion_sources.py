@@ -65,7 +65,7 @@ class MotionSources:
 
     def __init__(self, choice: str) -> None:
         self.displaced: Refusal | None = None
-        """That the displacements of the sources differ, if they do."""
+        """The difference of the displacements of both sources as a text, if they differ."""
         self._choice = choice
         self._sources = {ODOM: Source(), AUTOPILOT: Source()}
         self._height_path = Path()
@@ -130,7 +130,7 @@ class MotionSources:
         self._height_path = Path()
 
     def fresh_yaw(self, max_age: float, now: float) -> float | None:
-        """Return the yaw, rad, the autopilot's first: it obeys in its own frame; else None."""
+        """Return the autopilot's yaw, rad, or odom's if the autopilot's is not fresh, or None."""
         yaws = (self._sources[source].yaw() for source in (AUTOPILOT, ODOM))
         return next((yaw for yaw, time in yaws if now - time <= max_age), None)
 
@@ -140,7 +140,7 @@ class MotionSources:
         return by_source or self.known_motion(limits, now).braking
 
     def known_motion(self, limits: GateLimits, now: float) -> KnownMotion:
-        """Return what is known of the motion at ``now``, s."""
+        """Return the known motion at ``now``, s."""
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
         _, yaw_time = odom.yaw()
         # Compared at the same time: at 1 rad/s odometry 0.25 s late would differ by 0.25 rad.
@@ -152,7 +152,7 @@ class MotionSources:
     def compare(self, limits: GateLimits, engaged: bool, distrusted: bool, fused: bool,
                 now: float) -> KnownMotion:
         """
-        Compare the velocities and displacements; return what is known after that.
+        Compare the velocities and displacements; return the known motion.
 
         :param engaged: whether the vehicle flies by them.
         :param distrusted: whether the velocity of the autopilot is invalid.

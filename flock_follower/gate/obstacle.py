@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Why a command may not pass: a value that code compares, and a text for people."""
+"""The reason against a command: a value for comparisons in code, and a text for people."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 
 class Obstacle(enum.Enum):
-    """What keeps a command from being sent; the value is its text if there is no other."""
+    """Reason against sending a command; the value is the text if ``Refusal`` has no detail."""
 
     WITHHELD = 'not permitted'
     DISARMED = 'disarmed'
@@ -44,7 +44,7 @@ class Obstacle(enum.Enum):
 
 
 class Refusal(NamedTuple):
-    """A refusal of a command: the obstacle, and more about it."""
+    """A refusal of a command: the obstacle, and details."""
 
     cause: Obstacle
     detail: str = ''

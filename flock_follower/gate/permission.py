@@ -60,19 +60,19 @@ class Cause(enum.Enum):
     FAILED = enum.auto()
     """The vehicle refused the request, or did not execute it in time."""
     ENDED = enum.auto()
-    """By a request for another end of the flight."""
+    """A request ended the flight: hold, land, disarm or the end of the bridge."""
     STICK = enum.auto()
-    """By such a request because the pilot moved a stick."""
+    """A request ended the flight because the pilot moved a stick."""
     CONTESTED = enum.auto()
     """Two nodes give commands."""
     SILENT = enum.auto()
-    """The bridge fell silent, without a valid velocity."""
+    """The bridge stopped sending, because no velocity was valid."""
     MODE_UNKNOWN = enum.auto()
     LANDED = enum.auto()
     DISARMED = enum.auto()
     RESTARTED = enum.auto()
     GIVEN_BACK = enum.auto()
-    """The vehicle left the mode after the end of the flight."""
+    """The vehicle has left the mode after the flight was ended."""
     TAKEN = enum.auto()
     """The pilot, or a failsafe, left the mode."""
 
@@ -130,7 +130,7 @@ class Permission:
         return self.streams and self.obeyed
 
     def taken_over(self, now: float) -> str:
-        """Return that the pilot took over too recently for offboard at ``now``, s, or ''."""
+        """Return the refusal if a pilot took over too shortly before ``now``, s, or ''."""
         stick = self.cause is Cause.STICK
         taken = self.phase is Phase.TAKEN_OVER or stick
         if not taken or not self.taker.pilot or now - self.received >= TAKEOVER_TIME:
@@ -172,13 +172,13 @@ class Permission:
             f'two nodes command: {who}', Cause.CONTESTED)
 
     def fall_silent(self, why: str) -> Permission:
-        """Fall silent without a valid velocity: only silence starts the failsafe."""
+        """Stop sending, as no velocity is valid: only silence starts the failsafe."""
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
         return Permission(
             reason=f'fell silent: {why}', cause=Cause.SILENT) if self.streams else self
 
     def follow_silence(self, silence: float) -> Permission:
-        """Brake for good after a time, s, without the mode: the pilot may have taken over."""
+        """Brake until offboard is requested, after a time, s, without a report of the mode."""
         flown = self.phase in (Phase.READY, Phase.ACTIVE) and self.obeyed
         return self if not flown or silence <= LONGEST_SILENCE else self._giving_back(
             f'mode unknown for {silence:.0f} s, the pilot may have taken over',
@@ -193,13 +193,13 @@ class Permission:
         return Permission(reason=why, cause=Cause.RESTARTED)
 
     def leave_mode(self, status: VehicleStatus, taker: Taker = UNKNOWN) -> Permission:
-        """End a flight whose mode the pilot or the autopilot has changed."""
+        """End a flight after the pilot or the autopilot has changed the mode."""
         return Permission(Phase.TAKEN_OVER, _left_reason(status.mode, taker),
                           received=self.received, cause=Cause.TAKEN, taker=taker,
                           left_for=status.mode)
 
     def name_taker(self, taker: Taker, now: float) -> Permission:
-        """Name who took over, found at ``now``, s; the time of a pilot counts anew."""
+        """Set who took over, known at ``now``, s; the wait after a pilot begins at ``now``."""
         if self.phase is not Phase.TAKEN_OVER or taker == self.taker:
             return self
         return replace(self, reason=_left_reason(self.left_for, taker), taker=taker, received=(
@@ -240,7 +240,7 @@ def _left_reason(mode: str, taker: Taker) -> str:
 
 
 def _end_on_ground(status: VehicleStatus) -> Permission:
-    """Return the permission of a vehicle that stands, or is disarmed."""
+    """Return the permission after the vehicle has landed, or is disarmed."""
     if not status.armed:
         return Permission(reason='disarmed', cause=Cause.DISARMED)
     return Permission(reason=ON_GROUND, cause=Cause.LANDED)

@@ -50,10 +50,10 @@ _UNKNOWN: Final[Array] = np.zeros((6, 6))
 
 
 class Relative(NamedTuple):
-    """The permission of a command that rests on the marker alone."""
+    """The permission for commands that are based on the marker alone."""
 
     lasted: float = math.nan
-    """Time flown without odometry, s; NaN: not permitted."""
+    """Time flown without odometry, s; NaN: not permitted now."""
     begins: bool = False
     """Whether it has just begun, so that no command can have arrived yet."""
 
@@ -110,7 +110,7 @@ class RelativeFlight:
         self._time = -math.inf
 
     def lasts(self, now: float) -> float:
-        """Return how long it has lasted, with earlier flights, s; NaN: not permitted."""
+        """Return the total time flown without odometry, s; NaN: not permitted."""
         lasted = self._spent + min(now, self._usable_since) - self._begun
         permitted = self.reckoning is not None and 0.0 <= lasted <= self._timeout
         return lasted if permitted else math.nan
@@ -128,7 +128,8 @@ class RelativeFlight:
         :param active: whether the vehicle flies our setpoints by permission.
         :param commanded: whether the last setpoint was a command.
         :param usable: whether odometry may be flown on.
-        :param height: by barometer or rangefinder, m; without one it does not begin.
+        :param height: by barometer or rangefinder, m; without a height the flight without odometry
+            does not begin.
         """
         elapsed, self._time = max(now - self._time, 0.0), now
         self._flown = active and (self._flown or (usable and commanded))

@@ -99,8 +99,8 @@ def decide(situation: Situation) -> Setpoint:
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
     Whatever the situation holds (NaN, infinities, wrong shapes, ages in the future), the
-    acceleration is finite, at most ``a_max`` long, and does not point upwards on the ground; less
-    the offset it never leads to a speed above ``v_max``.
+    acceleration is finite, at most ``a_max`` long, and does not point upwards on the ground;
+    without the offset it never leads to a speed above ``v_max``.
     """
     known, place, held = situation.known, situation.place, situation.held
     yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None
@@ -152,7 +152,7 @@ def _no_command(kind: str, refusal: Refusal, yaw: float | None,
 
 
 def _sane_offset(offset: ArrayLike) -> Array:
-    """Return an offset (3,), m/s^2, with its vertical part bounded; zeros if not finite."""
+    """Return an offset (3,), m/s^2, whose vertical part is limited; zeros if not finite."""
     vector = finite_vector(offset)
     if vector is None:
         return np.zeros(3)
@@ -184,7 +184,7 @@ def find_refusal(situation: Situation) -> Refusal | None:
 
 
 def _odometry_refusal(known: KnownMotion) -> Refusal | None:
-    """Return why a command may not rest on the odometry, or None."""
+    """Return why a command based on odometry is refused, or None."""
     if known.velocity is not None:
         return Refusal(known.contradiction) if known.contradiction else None
     if known.never:
@@ -193,7 +193,7 @@ def _odometry_refusal(known: KnownMotion) -> Refusal | None:
 
 
 def _marker_obstacle(situation: Situation) -> Obstacle | None:
-    """Return why a command may not rest on the marker alone, or None."""
+    """Return why a command based on the marker alone is refused, or None."""
     limits, relative, place = situation.limits, situation.relative, situation.place
     if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
         return Obstacle.NOT_RELATIVE
@@ -206,9 +206,9 @@ def _marker_obstacle(situation: Situation) -> Obstacle | None:
 
 def _relative(full: GateLimits, command: Command, offset: Array, place: Location) -> Setpoint:
     """
-    Return the setpoint of a command that rests on the marker alone.
+    Return the setpoint of a command that is based on the marker alone.
 
-    Heights go first, then the limit of the acceleration; the speed is not known.
+    Heights have priority, then the limit of the acceleration; the speed is not known.
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE)
     strongest = RELATIVE_ACCELERATION_MAX * SENT_INSIDE
@@ -235,7 +235,7 @@ def _with_offset(acceleration: Array, offset: Array, a_max: float, axis: Array |
     """
     Return the sum of a command and an offset (3,), m/s^2, shortened to ``a_max``.
 
-    The height goes first, then the part along ``axis``, a horizontal unit vector, then the rest.
+    The vertical part has priority, then the part along ``axis``, a horizontal unit vector.
     """
     strongest = a_max * SENT_INSIDE
     total = acceleration + offset
@@ -253,7 +253,7 @@ def _with_offset(acceleration: Array, offset: Array, a_max: float, axis: Array |
 
 
 def _is_sum(total: Array, acceleration: Array, offset: Array) -> bool:
-    """Return whether a sum was not shortened."""
+    """Return whether a vector is the full sum, not a shortened one."""
     return bool(total.tolist() == (acceleration + offset).tolist())
 
 
@@ -269,8 +269,8 @@ def _limit_and_offset(limits: GateLimits, nominal: Array, offset: Array, velocit
     """
     Return the acceleration within limits and envelope that is nearest to ``nominal``, and offset.
 
-    The offset compensates a disturbance: the vehicle accelerates by the rest. Along a velocity
-    above OVERSPEED times ``v_max`` nothing is offset: the estimate may be wrong.
+    The offset compensates a disturbance: the vehicle accelerates by the rest. If the speed exceeds
+    OVERSPEED times ``v_max``, no offset acts along the velocity: the estimate may be wrong.
     """
     horizon, v = limits.speed_horizon + velocity.margin, velocity.vector
     safe = limit_command(nominal, v, limits.a_max, limits.v_max, horizon, axis)

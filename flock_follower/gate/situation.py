@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The situation of one decision: all that ``setpoint_rules.decide`` may know, as one value.
+The situation of one decision: all inputs of ``setpoint_rules.decide`` as one value.
 
 The gate collects its inputs into a ``Situation``, and ``decide`` turns it into a setpoint.
 ``to_json`` writes it as one line, ``from_json`` reads it: a decision can be made again.
@@ -58,10 +58,10 @@ class Held(NamedTuple):
 
 
 class VehicleReport(NamedTuple):
-    """What the autopilot reports of the vehicle, and how old that is."""
+    """The autopilot's report of the vehicle, and the age of this report."""
 
     armed: bool
-    """Whether it is armed; before, setpoints are level."""
+    """Whether it is armed; while it is not, setpoints are level."""
     airborne: bool
     """Whether it flies: on the ground PX4 takes any upward acceleration as a request to take
     off."""
@@ -73,7 +73,7 @@ class VehicleReport(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """What is known at ``now``, s on the monotonic clock; vectors are ENU."""
+    """All inputs of a decision at ``now``, s on the monotonic clock; vectors are ENU."""
 
     now: float
     limits: GateLimits
@@ -88,7 +88,7 @@ class Situation:
     withheld: str
     """Why nothing may be sent at all, such as a pilot who has taken over; '' permits."""
     unplaced: Refusal | None
-    """Why a place that was known is not usable now."""
+    """Why height or position, known before, cannot be used now."""
     place: Location
     """The vehicle's location in its envelope."""
     held: Held

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the gate knows of the vehicle and of its autopilot."""
+"""Status of the vehicle, and properties of its autopilot, as the gate uses them."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class VehicleStatus(NamedTuple):
 
 
 class AutopilotTraits(NamedTuple):
-    """What the autopilot is like, as far as the gate depends on it."""
+    """Properties of the autopilot that the gate depends on."""
 
     hover_thrust: str = 'the hover thrust'
     """Its parameter of the hover thrust."""
     needs_wind_offset: bool = False
     """Whether setpoints offset the wind, because the autopilot does not."""
     fused: bool = False
-    """Whether its estimate rests on our odometry, so that it is no evidence."""
+    """Whether its estimate fuses our odometry, and so cannot confirm the odometry."""

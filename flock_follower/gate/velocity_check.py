@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The vehicle's motion by odometry and by the autopilot, and which velocity may be used.
+Compares the vehicle's motion by odometry and by the autopilot; chooses the velocity to use.
 
 A velocity is used while it is fresh and plausible, and no other source contradicts it: braking on
 a wrong velocity accelerates the vehicle. Three comparisons find a contradiction:
@@ -126,13 +126,13 @@ class KnownMotion(NamedTuple):
     velocity: Velocity | None
     """By the source; None if it is not fresh."""
     never: bool
-    """Whether the source has not sent any yet."""
+    """Whether the source has not sent a velocity yet."""
     braking: Velocity | None
     """The velocity to brake with; None if none is fresh, or if two disagree."""
     contradiction: Obstacle | None
     """The contradiction between odom and the autopilot, if any."""
     blind: bool
-    """Whether every velocity has been invalid for too long, after a valid one."""
+    """Whether every velocity has been invalid for too long, after a valid velocity."""
     turned: float | None
     """Yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
     difference: Array | None
@@ -214,7 +214,7 @@ LATCH_TIME: Final[float] = 0.6
 
 
 class VelocityComparison:
-    """Averages the difference of two velocities; stores the time since which it is too large."""
+    """Averages the difference of two velocities, and measures how long it has been too large."""
 
     def __init__(self) -> None:
         self._average: Array = np.zeros(3)
@@ -347,7 +347,7 @@ class Path:
 
 def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     """
-    Return the recent displacement (3,) of ``one`` less that of ``other``, m.
+    Return the recent displacement (3,) of ``one`` minus that of ``other``, m.
 
     :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
     :returns: zeros if they do not overlap, or one of them is not recent.
@@ -427,7 +427,7 @@ class Source:
 def find_displacement(odom: Source, autopilot: Source | None, turn: float, height: Path,
                       now: float) -> Refusal | None:
     """
-    Return that the displacements of odometry and of another source differ, or None.
+    Return the difference if displacements of odometry and another source differ, or None.
 
     :param autopilot: None if its estimate is not independent of odometry.
     :param turn: yaw of odom minus that of the autopilot, rad.
@@ -442,7 +442,7 @@ def find_displacement(odom: Source, autopilot: Source | None, turn: float, heigh
 
 
 def _too_far(error: Array, std: float, other: str) -> Refusal | None:
-    """Return that displacements differ by more than their deviation, both m, permits, or None."""
+    """Return the difference if it exceeds the limit for a standard deviation, both m, or None."""
     distance = math.sqrt(error.dot(error))
     return None if not distance > max(TOLERANCE, 3.0 * std) else Refusal(
         Obstacle.DISPLACED, f'displacements of odom and of the {other} differ by '

@@ -113,7 +113,7 @@ class Bridge:
                                  self.end, require_failsafe)
         self.status = self.requests.status
         self.motion: tuple[OdometryState, float] | None = None
-        """While it flies without odometry, the motion by the attitude at a time, s."""
+        """During flight without odometry: the motion by the attitude, and its time, s."""
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
         self.ground_station = GroundStationReport()
@@ -176,11 +176,11 @@ class Bridge:
             self.telemetry.estimator, self.telemetry.gps, forwarded, now)
 
     def refusal(self, now: float) -> str:
-        """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""
+        """Return why ``offboard`` would be refused after a take-off, if known, or ''."""
         return self.requests.offboard_obstacle(now, bool(self.telemetry.is_flying(now)))
 
     def unready(self, now: float) -> str | None:
-        """Return the reasons against the service ``arm``, '' without any; None: unknown."""
+        """Return the reasons against the service ``arm``, or ''; None: unknown."""
         status, dialect = self.status(now), self.telemetry.dialect
         if status is None or dialect is None or status.armed or (
                 not self.housekeeping.has_reasons(now)):
@@ -293,7 +293,7 @@ class Bridge:
                     self.gate.permission.reason, cause=Cause.SILENT)))
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
-        """Set the zero of heights: the place of arming; home if the arming was not observed."""
+        """Set height 0: the place of arming, or home if the arming was not observed."""
         heights, flying = self.gate.heights, self.telemetry.is_flying(now)
         armed_now, self._armed = status.armed and self._armed is False, status.armed
         if flying is False and self.telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
@@ -307,7 +307,7 @@ class Bridge:
             heights.refer(above, now)
 
     def _end_flight(self, now: float) -> None:
-        """Hand the vehicle over if its flight must end."""
+        """Request the hold mode or a landing if the flight must end."""
         flies, pending, status = self.gate.flies, self.requests.pending, self.status(now)
         handover = self.handover
         if status is None:
@@ -341,13 +341,13 @@ class Bridge:
             self.forwarder.sent(room and self.link.send(message), now)
 
     def stop(self, now: float) -> None:
-        """Take no more commands: the following cycles brake."""
+        """Accept no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
         self.gate.permit(self.gate.permission.end('the bridge is stopping'))
 
     def has_stopped(self, now: float) -> bool:
-        """Return whether, after ``stop``, there is nothing left to wait for."""
+        """Return whether the end begun by ``stop`` is complete."""
         return not self.gate.flies or (self.gate.speed(now) or 0.0) < REST_SPEED or (
             now - self._stopping_since >= STOP_TIMEOUT)
 
@@ -386,7 +386,7 @@ class Bridge:
         self._attribute_takeover(now)
 
     def _attribute_takeover(self, now: float) -> None:
-        """Find out who has taken over; report it once it is known, or after EVIDENCE_AFTER."""
+        """Determine who has taken over; report it once known, or after EVIDENCE_AFTER."""
         permission, dialect = self.gate.permission, self.telemetry.dialect
         if permission.phase is not Phase.TAKEN_OVER or permission.taker in (PILOT, STICK) or (
                 dialect is None):

@@ -64,7 +64,7 @@ class Vehicle(NamedTuple):
     shown_time: float = math.inf
     """When HEARTBEAT or CURRENT_MODE last showed the requested state, s."""
     airborne: bool = True
-    """Whether it flies, as far as it reports."""
+    """Whether it reports that it flies; None without a report."""
 
 
 class Outcome(NamedTuple):
@@ -87,7 +87,7 @@ class Goal:
     ends_flight: bool = False
     """Whether it ends our control of the vehicle: it waits for no other request or HEARTBEAT."""
     insists: bool = False
-    """Whether it is requested even if the vehicle already shows it."""
+    """Whether the command is sent even if the vehicle already is in the requested state."""
     timeout: float = CONFIRM_TIMEOUT
     """Time to wait for the requested state, s."""
     stream: float = 0.0
@@ -101,7 +101,7 @@ class Goal:
 
 
 def enter(dialect: Dialect, mode: str, *others: str, ends_flight: bool = False) -> Goal:
-    """Return the goal of a mode; if that is refused, of the next one."""
+    """Return the goal of a mode; if it is refused, the next mode is requested."""
     return Goal(name=mode, command=_SET_MODE, params=dialect.set_mode_parameters(mode),
                 reached=lambda vehicle: vehicle.status.mode == mode, modes=(mode,),
                 ends_flight=ends_flight,
@@ -177,7 +177,7 @@ class Request:
     It takes every COMMAND_ACK; ``step``, called often, returns whether to send its command.
 
     :param superseded: the goal of a pending request, which may still be reached.
-    :param own: whether the bridge itself makes the request.
+    :param own: whether the bridge, not a person, makes the request.
     """
 
     def __init__(self, dialect: Dialect, goal: Goal, now: float, superseded: Goal | None = None,
@@ -255,7 +255,7 @@ class Request:
         return self
 
     def _is_shown(self, vehicle: Vehicle, now: float) -> bool:
-        """Return whether the vehicle shows that there is nothing to send at ``now``, s."""
+        """Return whether the vehicle has reached the goal, so that nothing is sent now, s."""
         self._mode = self._mode or vehicle.status.mode
         insists = self.current.insists or self._superseded is not None
         if self.current.reached(vehicle) and (self._attempts or not insists):
@@ -286,7 +286,7 @@ class Request:
         self._begin(instead, now, self._mode if vehicle is None else vehicle.status.mode)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
-        """Return the change by the pilot, or a failsafe, since the beginning, or ''."""
+        """Return the change of mode by the pilot or a failsafe since the beginning, or ''."""
         status, through = vehicle.status, self._dialect.takeoff_modes
         if self.current.command == TAKEOFF and not status.armed:
             return 'disarmed meanwhile'

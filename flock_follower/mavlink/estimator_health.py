@@ -159,7 +159,7 @@ class Arrivals:
         return max((later - time for time, later in pairwise(times)), default=0.0)
 
     def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
-        """Return whether the rate of a message is well below the requested one, Hz."""
+        """Return whether the rate of a message is well below the requested rate, Hz."""
         window = min(max(RATE_WINDOW, MIN_MESSAGES / wanted), REPORT_WINDOW)
         # One message more or less is chance.
         return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
@@ -167,7 +167,7 @@ class Arrivals:
 
 def find_misplacement(position: Array | None, home: Array | None, odometry: Array | None) -> str:
     """
-    Return why the estimate cannot be the vehicle's place, or ''.
+    Return why the estimated position must be wrong, or ''.
 
     :param position: LOCAL_POSITION_NED (3,), m, ENU; None: not known.
     :param home: HOME_POSITION (3,) in the same frame, m; None: not known.

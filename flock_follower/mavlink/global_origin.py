@@ -51,7 +51,7 @@ TRIES: Final[int] = 3
 
 class GlobalOrigin:
     """
-    Sends the origin, and says whether odometry has to wait for it.
+    Sends the origin, and decides whether odometry has to wait for the origin.
 
     :param given: latitude, longitude, deg, and height, m; None: ``ANY_ORIGIN`` for PX4, none for
         ArduPilot.
@@ -72,7 +72,7 @@ class GlobalOrigin:
         self._began = math.inf  # of the first step, s
 
     def begin_again(self) -> None:
-        """Forget everything, the origin too: the autopilot may have rebooted, or is another."""
+        """Reset all, the origin too, after a reboot of the autopilot or with another autopilot."""
         self.obstacle, self.awaited = '', self._without_gps
         self._time, self._began = -math.inf, math.inf
         self._requests = self._tries = 0

@@ -63,15 +63,15 @@ class Sample(NamedTuple):
     """One answer: the bounds of the autopilot's clock minus ours, ns."""
 
     most: int
-    """The answer was written after the request."""
+    """Upper bound: the answer was written after the request."""
     least: int
-    """The answer was written before it arrived."""
+    """Lower bound: the answer was written before its arrival."""
     time: int
     """Time of reception, ns."""
 
 
 class TimeSync:
-    """Our side of TIMESYNC; times are integer nanoseconds of one monotonic clock."""
+    """TIMESYNC on our computer; times are integer nanoseconds of one monotonic clock."""
 
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=TIMESYNC_SAMPLES)
@@ -225,7 +225,7 @@ class Housekeeping:
         self._request_reasons_in_time(now)
 
     def changes(self) -> list[str]:
-        """Return the parameters that a rule depends on and that have just changed in flight."""
+        """Return changes in flight of parameters that a rule depends on."""
         status = self._link.telemetry.status
         return self.watch.step(self.parameters.values, self.parameters.watched_names(),
                                status is not None and status.armed)
@@ -265,7 +265,7 @@ class Housekeeping:
                     *filter(None, (dialect.minimum_takeoff, switch))])
 
     def unreceived_reason(self, now: float) -> str:
-        """Return why the autopilot does not receive our messages, or ''."""
+        """Return the evidence that the autopilot does not receive our messages, or ''."""
         if not self._link.questions.is_unanswered(now):
             return ''  # also of one that signs: USB needs no signature
         return NO_ANSWER if self._link.signing or not self._link.autopilot_signs else UNSIGNED
@@ -276,7 +276,7 @@ class Housekeeping:
                 for name, message_id in ESTIMATE.items()}
 
     def too_slow(self, now: float) -> str:
-        """Return that the rate of the estimate is too low, or that the link stalls, or ''."""
+        """Return the fault if the rate of the estimate is too low or the link stalls, or ''."""
         if now - self._alive_since < REPORT_WINDOW + TIMESYNC_PERIOD:
             return ''  # the streams were requested too recently
         problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} requested'

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Who sends: the names of devices that are no autopilot, and two vehicles with one system id.
+Identity of senders: devices that are no autopilot, and two vehicles with one system id.
 
-MAVLink distinguishes vehicles by their system ids alone. Two vehicles with one id show by values
-that one vehicle changes steadily, and two in turns: the time of boot, the position, and the
-sequence numbers of the messages. Times are s.
+MAVLink distinguishes vehicles by their system ids alone. Two vehicles with one id are detected by
+values that are steady for one vehicle and alternate for two: the time of boot, the position, and
+the sequence numbers of the messages. Times are s.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class _Source(Generic[T]):
 
 class TwoSources(Generic[T]):
     """
-    Finds out whether values come from two sources in turn.
+    Detects values that come alternately from two sources.
 
     :param distance: between two values. :param most: the largest distance of two values of one
         source that are so many s apart.
@@ -120,7 +120,7 @@ class TwoSources(Generic[T]):
         self._sources: list[_Source[T]] = []  # the newest last
         self._turns = 0
         self.found = -math.inf
-        """When two were found last, s."""
+        """Time of the last detection of two sources, s."""
 
     def take(self, value: T, now: float) -> None:
         """Take a value."""

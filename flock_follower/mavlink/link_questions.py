@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What was asked of the autopilot, and what it has answered: an unanswered question is unknown.
+The questions to the autopilot, and its answers: without an answer the value is unknown.
 
 ``sent`` and ``take`` recognize questions and answers in the messages themselves, so that no
 question can be asked without being counted. Only a message that exists because of ours is an
@@ -67,7 +67,7 @@ class Question:
         self.tries, self.since, self.answered = 0, math.inf, now
 
     def is_ignored(self, now: float) -> bool:
-        """Return whether the question was asked often and long enough without an answer."""
+        """Return whether the question has had no answer for enough tries and time."""
         return self.tries >= TRIES and now - self.since >= PATIENCE
 
 
@@ -89,7 +89,7 @@ class LinkQuestions:
         self._questions, self._any = {}, Question()
 
     def pause(self) -> None:
-        """Count no question that was asked before a loss of the link; keep the answers."""
+        """Stop counting the questions from before a loss of the link; keep the answers."""
         for question in (self._any, *self._questions.values()):
             question.tries, question.since = 0, math.inf
 

@@ -65,7 +65,7 @@ _UPPER = np.triu_indices(6)
 
 class OdometryForwarder:
     """
-    Takes odometry as it arrives, and returns messages no faster than the line carries.
+    Takes odometry, and returns messages at no more than the rate that the line can carry.
 
     :param rate: largest rate of the messages, Hz; a link of 57,600 baud carries 10 of 245 bytes.
     """
@@ -102,7 +102,7 @@ class OdometryForwarder:
         return ''
 
     def withhold(self) -> None:
-        """Drop the queued states: the autopilot may not take odometry yet."""
+        """Drop the queued states, because the autopilot is not ready for odometry."""
         if self._queue:
             self.counters['before the origin'] += len(self._queue)
         self._queue.clear()
@@ -131,7 +131,7 @@ class OdometryForwarder:
 
 def has_jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
     """
-    Return whether a pose is not the one predicted from time ``then``, s, or time decreased.
+    Return whether a pose differs from its prediction from ``then``, s, or time decreased.
 
     A rule of its own: each jump that is counted resets the autopilot's estimate, so the small
     steps by which ``derivation`` restarts its filter must not count.

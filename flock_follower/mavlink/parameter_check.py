@@ -164,7 +164,7 @@ class CheckResult(NamedTuple):
     unproven: str = ''
     """For people: the firmware, if no recommendation is known for it."""
     unread: tuple[str, ...] = ()
-    """The names of what was not answered: unknown, and so neither good nor bad."""
+    """Names of parameters without an answer: their values are unknown."""
 
 
 class ParameterCheck:
@@ -222,14 +222,14 @@ class ParameterCheck:
         return ''.join(due[:1])
 
     def watched_names(self) -> list[str]:
-        """Return the names that were answered and that a rule depends on: to read repeatedly."""
+        """Return the names to read repeatedly: answered before, and part of a rule."""
         if self._dialect is None:
             return []
         kept = {*self._dialect.watched, *(rule.name for rule in self._dialect.rules)}
         return [name for name in self.values if name in kept]
 
     def is_known(self, name: str) -> bool:
-        """Return whether a value was answered, and no longer ago than some requests."""
+        """Return whether a value was answered within the last few requests."""
         return name in self.values and self._tries.get(name, 0) <= UNKNOWN_AFTER
 
     def _names(self, version: Version | None) -> list[str]:

@@ -85,9 +85,9 @@ class Requests:
 
     def offboard(self, value: bool, now: float, obstacle: str = '') -> Request:
         """
-        Let the vehicle fly our setpoints, or hold its position.
+        Request the mode that flies our setpoints, or the hold mode.
 
-        :param obstacle: why setpoints would not be those of one commander, or ''.
+        :param obstacle: why more than one node commands, or ''.
         """
         self._end.begin()
         if not value:
@@ -201,7 +201,7 @@ class Requests:
 
     def offboard_obstacle(self, now: float, in_air: bool = True) -> str:
         """
-        Return why the vehicle may not fly our setpoints now, as far as it is received, or ''.
+        Return why the vehicle may not fly our setpoints now, by the received messages, or ''.
 
         :param in_air: whether it must be in the air, and in the envelope, now.
         """

@@ -128,7 +128,7 @@ class SetpointThread:
             self._refuse_submitted()
 
     def _turn(self, next_cycle: float) -> float:
-        """Listen until the next cycle is due, run it, and return when the one after is."""
+        """Listen until a cycle is due, run it, and return the time of the next cycle."""
         wait = 0.0 if self._submitted else max(0.0, next_cycle - time.monotonic())
         if not self._guard(lambda: self._listen(wait)):
             # Otherwise listening that fails at once would be repeated without a pause.

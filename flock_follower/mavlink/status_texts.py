@@ -221,7 +221,7 @@ class StatusTexts:
         self._begun = None
 
     def against(self, mode: str) -> list[str]:
-        """Return the failed checks for a mode (named as in ``dialects.PX4``) or arming in it."""
+        """Return the failed checks for a mode (a name of ``dialects.PX4``) or for arming in it."""
         return [failure.text for failure in self._failures
                 if mode in _MODES and failure.modes >> _MODES[mode] & 1
                 # Reports for every mode include warnings, which prevent none,
@@ -240,7 +240,7 @@ class StatusTexts:
         return '; '.join(dict.fromkeys([*reported, *self.against(mode)]))
 
     def since(self, time: float) -> list[str]:
-        """Return the distinct texts from ``time`` on that are more than information."""
+        """Return the distinct texts since ``time`` whose severity is above INFO."""
         return list(dict.fromkeys(
             text for t, severity, text in self._texts
             if t >= time and severity < mavlink.MAV_SEVERITY_INFO))

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Who has taken the vehicle from the bridge: a pilot, or a failsafe of the autopilot, and which one.
+Determines who has taken over the vehicle: a pilot, or which failsafe of the autopilot.
 
 PX4 reports by CURRENT_MODE the mode that it flies and the mode that was chosen: a failsafe flies
 another mode than the chosen one, a pilot chooses one. PX4 names the cause in EVENTs. ArduPilot
@@ -70,7 +70,7 @@ _NO_CHANGE: Final = re.compile(r'continuing|cleared|recovered', re.IGNORECASE)
 
 
 def failsafe(why: str) -> Taker:
-    """Return a failsafe as the one who took over."""
+    """Return the taker for a failsafe."""
     return Taker(f'failsafe: {why}', False)
 
 

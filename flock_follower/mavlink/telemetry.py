@@ -194,7 +194,7 @@ class Telemetry:
 
     def silence(self, now: float) -> float:
         """
-        Return the time for which messages of the autopilot have been overdue, s; 0 if none is.
+        Return how long messages of the autopilot have been overdue, s; 0 if none is.
 
         Any message shows that the link is alive; the mode has its own clock, ``mode_age``. Before
         telemetry streams only HEARTBEAT may come, at 1 Hz, and single ones may be lost.
@@ -283,7 +283,7 @@ class Telemetry:
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
 
     def forget(self) -> None:
-        """Drop home and clock of an autopilot that rebooted or was replaced; not the origin."""
+        """Reset home and clock after a reboot or replacement of the autopilot, not the origin."""
         self.newest.pop('HOME_POSITION', None)
         self._boot_time_ms, self._fallen = 0, False
 

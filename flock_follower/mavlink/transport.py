@@ -59,7 +59,7 @@ IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
 
 class _Line:
-    """A descriptor that may be lost, and bytes that it did not accept at once."""
+    """A descriptor that may be lost, and the bytes that it has not accepted yet."""
 
     peer: Any = 'line'
     capacity = 0.0
@@ -83,7 +83,7 @@ class _Line:
         raise NotImplementedError
 
     def _call(self, call: Callable[[], T]) -> T | None:
-        """Return the result of a system call; None if it has to wait, or the line is lost."""
+        """Return the result of a system call; None if it would block, or the line is lost."""
         try:
             return call()
         except (BlockingIOError, InterruptedError):
@@ -126,7 +126,7 @@ class _Line:
         return bool(taken)
 
     def _waits(self) -> bool:
-        """Send the rest of the last message; return whether some of it still waits."""
+        """Send the rest of the last message; return whether a part is still unsent."""
         if self._waiting and self._fd >= 0:
             taken = self._call(lambda: os.write(self._fd, self._waiting))
             self._waiting = self._waiting[taken or 0:]

@@ -93,7 +93,7 @@ IMAGE_QOS = best_effort(10)
 
 
 class BlackBox(FlockNode):
-    """Takes messages as they come, and writes them in a thread of its own."""
+    """Receives messages, and writes them in a separate thread."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('black_box', **kwargs)
@@ -159,13 +159,13 @@ class BlackBox(FlockNode):
         self._inputs.append((topic, handle, kind, change))
 
     def _ask(self) -> None:
-        """Ask the nodes whose parameters are not known, if they run."""
+        """Request the parameters of the running nodes whose parameters are not known."""
         for name in list(self._unasked):
             if self._nodes[name].ask():
                 self._unasked.discard(name)
 
     def _note(self, _: dict[str, Any]) -> None:
-        """Note the parameters flown as a file for ``evaluate``, and the neighbors beside them."""
+        """Write the parameters of the flight and the neighbors as files for ``evaluate``."""
         flown = {}
         for name, node in zip(OURS, self._nodes.values()):
             if node.values is None:
@@ -185,8 +185,8 @@ class BlackBox(FlockNode):
         """
         Receive messages until shutdown.
 
-        This method has a thread of its own, because Fast DDS can block a publisher in the executor
-        for a second after another process was killed.
+        This method runs in a separate thread, because Fast DDS can block a publisher in the
+        executor for a second after another process was killed.
         """
         while not self._ending.wait(TAKE_PERIOD):
             try:
@@ -220,7 +220,7 @@ class BlackBox(FlockNode):
                 self._taken.append(TakenMessage(topic, stamp, data))
 
     def _write_on(self) -> None:
-        """Write until the end, and finish the recording."""
+        """Write messages until shutdown, and finish the recording."""
         while not self._ending.wait(WRITE_PERIOD):
             self._write()
         self._retry = 0.0

@@ -56,7 +56,7 @@ _HEIGHT = next(spec.range.high for spec in MAVLINK_BRIDGE if spec.name == 'takeo
 
 def patience(service: str) -> float:
     """
-    Return how long to wait for the answer of a service, s: longer than the service itself does.
+    Return how long to wait for the answer of a service, s: longer than the service needs.
 
     A take-off waits for the offboard mode first on ArduPilot, then for the climb.
     """
@@ -65,7 +65,7 @@ def patience(service: str) -> float:
 
 
 def proposal(service: str, there: Iterable[str]) -> str:
-    """Return a question for the service that is meant, or ''; ``there`` are full names."""
+    """Return the text "did you mean ...?", or ''; ``there`` are the full names of the services."""
     last = service.rpartition('/')[2]
     known = {*there, *OUR_SERVICES}
     meant = sorted(name for name in known if name.rpartition('/')[2] == last and name != service)
@@ -98,7 +98,7 @@ class Caller(Node):
         return 0 if success else 1
 
     def _call(self, executor: SingleThreadedExecutor) -> tuple[bool, str]:
-        """Wait for the service, call it once, and return its answer, or what failed."""
+        """Wait for the service, call it once, and return its answer or the failure."""
         deadline = time.monotonic() + self._timeout
         while not self._client.service_is_ready():
             if time.monotonic() >= deadline:

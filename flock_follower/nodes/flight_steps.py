@@ -94,7 +94,7 @@ class Reports:
 
     @property
     def vehicle_known(self) -> bool:
-        """Return whether the bridge, and its diagnostics of up to 1 s later, know the vehicle."""
+        """Return whether the bridge and its later diagnostics know the vehicle."""
         return parse(self.bridge).name != NO_AUTOPILOT and None not in (
             self.flag('mavlink_bridge', ARMED), self.flag('mavlink_bridge', FLYING))
 
@@ -104,7 +104,7 @@ class Reports:
         return parse(self.bridge).last_known.name in (READY, ACTIVE)
 
     def due(self) -> str:
-        """Return the first step whose result is not reported, '' while the vehicle follows."""
+        """Return the first step whose result is not reported; '' while the vehicle follows."""
         reached = {'arm': self.flag('mavlink_bridge', ARMED),
                    'takeoff': self.flag('mavlink_bridge', FLYING),
                    'offboard': parse(self.bridge) == BridgeState(ACTIVE),
@@ -150,7 +150,7 @@ class Flight:
         self._confirm, self._requested, self._ready = confirm, set[str](), ready
 
     def step(self, reports: Reports, now: float) -> list[str]:
-        """Ask for the key of the step that is due, or request it; end after a landing."""
+        """Ask for the key of the next step, or request the step; end after a landing."""
         if self._pending or self._ending is not None:
             return []
         due = reports.due() if self._ready else ''

@@ -102,7 +102,7 @@ class _Call:
             raise
 
     def refuse(self, outcome: Outcome = STOPPING) -> None:
-        """End the call, because the setpoint thread ends before its turn, or takes no more."""
+        """End the call without a request, because the setpoint thread ends."""
         self.outcome = outcome
 
     def result(self) -> Outcome | None:
@@ -258,7 +258,7 @@ class MavlinkBridge(FlockNode):
         return response
 
     def _answer_calls(self, otherwise: Outcome | None = None) -> None:
-        """Answer the calls that have an outcome; with ``otherwise`` those that have none, too."""
+        """Answer the calls that have an outcome; answer the others with ``otherwise`` if given."""
         for call in self._calls:
             if (outcome := call.result() or otherwise) is not None:
                 call.answer.set_result(outcome)
@@ -267,7 +267,7 @@ class MavlinkBridge(FlockNode):
     # The setpoint thread: it publishes and logs by the publisher thread, without locks of rclpy.
 
     def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
-        """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
+        """Pass states with their ages, s, and arrival times, s, to the gate and the autopilot."""
         for state, age, now in taken:
             refusals = [self._bridge.gate.take_motion(
                 ODOM, MotionReport.from_odometry(state), age, now)]

@@ -20,14 +20,14 @@ The observer publishes nothing and sets nothing; it requests the parameters of o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 import os
 from pathlib import Path
 import signal
 import time
-from typing import Any
+from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
@@ -72,6 +72,8 @@ DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics
 #: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom')
+#: The desk's simulator by its names: its load is ours, as in ``fly``.
+SIMULATOR: Final = ('simulator', 'simulator_node')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom')
 #: Our names of the topics that relative_pose subscribes to, by their types.
 BY_TYPE = {IMAGE: RAW_IMAGES, COMPRESSED: COMPRESSED_IMAGES, INFO: 'camera_info', ODOMETRY: 'odom'}
@@ -108,7 +110,7 @@ class Observer(Node):
         """
         executor = SingleThreadedExecutor()
         executor.add_node(self)
-        ours = [process for process, *_ in processes()]
+        ours = [os.getpid(), *(process for process, *_ in processes((*OURS, *SIMULATOR)))]
         meter, end = LoadMeter(lambda: ours), self._begin + self._seconds
         try:
             while rclpy.ok() and (now := time.monotonic()) < end:
@@ -130,7 +132,7 @@ class Observer(Node):
         return load(own or resource('config/neighbors.yaml'))
 
     def _look(self) -> None:
-        """Ask nodes that are new for their parameters, and subscribe to topics that are new."""
+        """Request the parameters of new nodes, and subscribe to new topics."""
         nodes = self._nodes()
         for node in OURS:
             full = full_name(node, self.seen.namespace)
@@ -172,7 +174,7 @@ class Observer(Node):
                     self._take, POSES, topic), best_effort(50))
 
     def _names_of(self, relative_pose: str) -> None:
-        """Take the names of our topics from the subscriptions of relative_pose."""
+        """Read the names of our topics from the subscriptions of relative_pose."""
         namespace, _, name = relative_pose.rpartition('/')
         for topic, types in self.get_subscriber_names_and_types_by_node(name, namespace or '/'):
             ours = BY_TYPE.get(types[0])
@@ -225,12 +227,12 @@ class Observer(Node):
                 del seen.topics[topic]
 
 
-def processes() -> Iterator[tuple[int, str, dict[str, str]]]:
+def processes(names: Collection[str] = OURS) -> Iterator[tuple[int, str, dict[str, str]]]:
     """Yield id, name and environment of our nodes on this computer, but not of other users'."""
     for folder in Path('/proc').glob('[0-9]*'):
         with suppress(OSError):  # ended meanwhile, or of another user
             words = _words(folder / 'cmdline')
-            for node in OURS:
+            for node in names:
                 if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
                     yield int(folder.name), node, dict(
                         entry.split('=', 1) for entry in _words(folder / 'environ')

@@ -183,7 +183,7 @@ class Pilot(Node):
             self._request(self._flight.answer(step, success, message, self._reports, now))
 
     def _show(self, now: float) -> None:
-        """Print; an error of the terminal must not prevent the handing over."""
+        """Print; ignore errors of the terminal, which must not prevent the handover."""
         with contextlib.suppress(OSError):
             for line in self._flight.lines:
                 self._line.print_above(line)
@@ -194,7 +194,7 @@ class Pilot(Node):
 
 @contextlib.contextmanager
 def _single_keys() -> Iterator[None]:
-    """Have the terminal give each key at once, without Enter."""
+    """Set the terminal to deliver each key at once, without Enter."""
     if not os.isatty(0):
         yield
         return

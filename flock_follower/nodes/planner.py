@@ -181,7 +181,7 @@ class Planner(FlockNode):
             self.get_logger().info(f'the bridge: {reported}')
 
     def _bridge_age(self) -> float:
-        """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
+        """Return how long the bridge has been silent, s, in wall time: it repeats its state."""
         return time.monotonic() - self._bridge_received
 
     def _take_camera_info(self, message: CameraInfo, _: int, camera: str) -> None:
@@ -208,7 +208,7 @@ class Planner(FlockNode):
             self._silence.reset()
 
     def _on_silence(self) -> None:
-        """Brake at once when images cease, instead of up to a period later."""
+        """Brake at once when images stop, instead of at the next tick."""
         self._silence.cancel()
         self._poll_frames()
         if self._silence.is_canceled():  # none has come meanwhile

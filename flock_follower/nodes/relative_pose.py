@@ -139,11 +139,11 @@ class RelativePose(FlockNode):
         self._misprints: dict[str, tuple[float, Fault]] = {}
 
         self.marked = any(n.markers for n in self._tracker.config.neighbors)
-        """Whether a neighbor has a marker: else no image is needed."""
+        """Whether a neighbor has a marker; without markers no image is needed."""
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
         self._polls: list[Callable[[], None]] = []
-        """Take the odometry that waits, and before it the motion that is flown on without it."""
+        """Process the received odometry, and before it the received motion without odometry."""
         if not self._tracker.alone:
             self._own = OwnOdometry(
                 self, self._values, self._use_odometry, awaited=self._awaited)
@@ -202,7 +202,7 @@ class RelativePose(FlockNode):
             self._tracker.ranging.waiting or self._perceiver.sources.has_waiting)
 
     def poll_odom(self) -> None:
-        """Take the own motion that waits."""
+        """Process the received ego motion."""
         for poll in self._polls:
             poll()
 
@@ -241,7 +241,7 @@ class RelativePose(FlockNode):
                 self.diagnostics.reject(*outcome)
 
     def _process_pending(self) -> None:
-        """Process every image that need not or will not wait any longer."""
+        """Process every image whose odometry has arrived or is overdue."""
         self._overdue.cancel()
         try:
             while (seen := self._perceiver.process(
@@ -272,7 +272,7 @@ class RelativePose(FlockNode):
             self._transforms.publish(transforms(make, states, self.get_namespace()))
 
     def _use_sources(self) -> None:
-        """Use the poses of other detectors that need not wait any longer."""
+        """Use the poses of other detectors whose odometry has arrived."""
         if self._sources is None:
             return
         now = time.monotonic()

@@ -199,7 +199,7 @@ class Replay(FlockNode):
         return self.bag.messages([*self._outputs], *self._section)
 
     def _play_over(self, step: float, stamp_ns: int) -> None:
-        """Go to a message after a gap in the bag's times, s, without waiting for it."""
+        """Continue at the message after a gap in the bag's times, s, without waiting."""
         before = stamp_ns / NS_PER_S - step - self.bag.start_ns / NS_PER_S
         self._line.print_above(
             f'warning: the times in the bag jump by {step:+.1f} s at {before:.1f} s: the clock '

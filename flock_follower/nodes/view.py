@@ -130,7 +130,7 @@ class View(FlockNode):
             self._listen(BatteryState, 'mavlink/battery', lambda m: take.take_battery(ShownBattery(
                 time.monotonic(), m.percentage, m.voltage)), best_effort())]
         self._open: list[Subscription] = []
-        """Those that only an open page needs."""
+        """The subscriptions that only an open page needs."""
         self._wake = self.create_guard_condition(self._on_wake)
         self._timer = self.create_timer(IDLE_PERIOD, self._turn, clock=STEADY)
         self._server = PageServer(
@@ -184,7 +184,7 @@ class View(FlockNode):
                 each.callback(received[0])
 
     def _on_wake(self) -> None:
-        """Take a turn at once: a page was opened or closed, or a button pressed."""
+        """Run the turn at once, after a page was opened or closed, or a button was pressed."""
         try:
             self._turn()
         except Exception as error:
@@ -215,7 +215,7 @@ class View(FlockNode):
         self._server.send_state(self._flight.page(time.monotonic()))
 
     def _watch(self, watched: bool) -> None:
-        """Subscribe to what only an open page needs, or no more."""
+        """Subscribe to the topics that only an open page needs, or unsubscribe."""
         for subscription in self._open:
             self.destroy_subscription(subscription)
         self._open, self._pending = [], None
@@ -281,7 +281,7 @@ class View(FlockNode):
             self._model = CameraModel.from_info(message, self._camera.rectified)
 
     def _send_picture(self, data: bytes, kind: Any) -> None:
-        """Draw what was estimated at the stamp of an image into it."""
+        """Draw the estimates at an image's stamp into the image."""
         try:
             message = deserialize_message(data, kind)
             stamp = stamp_to_nanoseconds(message.header.stamp)
@@ -319,7 +319,7 @@ class View(FlockNode):
             state.velocity, state.angular_velocity, derived=state.derived))
 
     def _take_distances(self, now: float) -> None:
-        """Date the distances that came since the last turn by their stamps, the last one now."""
+        """Set the times of the new distances by their stamps; the last one is of now."""
         stamps = [stamp_to_nanoseconds(message.header.stamp) for message in self._distances]
         for stamp, message in zip(stamps, self._distances):
             before = (stamps[-1] - stamp) / NANOSECONDS
@@ -336,7 +336,7 @@ class View(FlockNode):
                     {pair.key: pair.value for pair in status.values}))
 
     def _call(self, button: str, now: float) -> None:
-        """Call the service of a button: at each press, the answer to the last may be lost."""
+        """Call the service of a button at each press, because the last answer may be lost."""
         value = CALLS[button][1]
         request = Trigger.Request() if value is None else SetBool.Request(data=value)
         self.get_logger().info(f'{button}: pressed on the page')

@@ -132,7 +132,7 @@ class OdometryBuffer:
         self._storage: Array = np.empty((2 * self.CAPACITY, 17))
         self._end = 0
         self._rows: Array = self._storage[:0]
-        """Those of ``_storage`` that are held, up to ``_end``: adding one copies no other."""
+        """The rows of ``_storage`` that are in use, up to ``_end``: adding one copies no other."""
         self._near = self._far = self._rough = 0.0
         self._comparisons = 0
 
@@ -294,7 +294,7 @@ class OdometryBuffer:
 
     def _agree(self, apart: Array, velocities: Array) -> bool:
         """
-        Return whether attitudes and angular velocities agree, but for the attitudes' white noise.
+        Return whether attitudes and angular velocities agree within the attitudes' white noise.
 
         The noise of the velocities (n, 3) is updated on the way.
 

@@ -151,10 +151,10 @@ class DerivedVelocity(_WhiteJerk):
 
     def take(self, stamp: float, position: Array) -> float:
         """
-        Take a position; return how far it jumped, m, else 0.
+        Take a position; return the size of its jump, m, else 0.
 
-        By positions alone, as not every source has a velocity that can be trusted: this is the
-        jump that is counted and reported, for ``check``, ``evaluate`` and the diagnostics.
+        Only positions are compared, because not every source has a reliable velocity. ``check``,
+        ``evaluate`` and the diagnostics count and report this jump.
         """
         dt = stamp - self.stamp
         if not 0.0 < dt <= ODOMETRY_GAP:
@@ -251,7 +251,7 @@ _Numbers = tuple[float, ...]
 
 class TwistFrame:
     """
-    Watches a source; ``frame`` is how to read its velocity: 'child', 'odom', or 'none' at all.
+    Determines the frame of a source's velocity, ``frame``: 'child', 'odom', or 'none'.
 
     :param wanted: one of these, which is then obeyed, or 'auto'.
     """
@@ -274,11 +274,11 @@ class TwistFrame:
 
     @property
     def frame(self) -> str:
-        """Return how to read the velocity now; 'none' while it is not known."""
+        """Return the frame of the velocity now; 'none' while it is not known."""
         return (self.found or NONE) if self.wanted == AUTO else self.wanted
 
     def reading(self, child: Array, odom: Array) -> str:
-        """Return how to read a velocity, given both readings (3,), m/s."""
+        """Return the frame to use for a velocity, given its value in both frames (3,), m/s."""
         if self.wanted != AUTO or self.found:
             return self.frame
         if self._failing or self.contradiction or not child.any():
@@ -290,7 +290,7 @@ class TwistFrame:
 
     @property
     def wrong_probability(self) -> float:
-        """Return the probability that the likelier reading is the wrong one; 0 if decided."""
+        """Return the probability that the more likely frame is wrong; 0 if decided."""
         if self.wanted != AUTO or self.found:
             return 0.0
         return 1.0 / (1.0 + math.exp(abs(self._evidence)))

@@ -128,7 +128,7 @@ class OdometrySource:
         self.events: list[tuple[str, str]] = []
         self._covariances_before: dict[str, tuple[bytes, Array]] = {}  # as given, as used
         self.missing: dict[str, str] = {}
-        """What the messages lack, and its replacement."""
+        """The values that the messages lack, and their replacements."""
         self._latencies: deque[float] = deque(maxlen=MAX_REPORTED)
         self._gaps: deque[float] = deque(maxlen=MAX_REPORTED)
         self._frames: tuple[str, str] | None = None

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Parameter files read whole: the checked values of the parameters of several nodes.
+Reads whole parameter files: the checked values of the parameters of several nodes.
 
 No node that flies loads this module; each reads its sections by ``parameters.sections``.
 """

@@ -108,7 +108,7 @@ def ignored_sections(path: str | Path, node: str) -> str:
 
 @contextmanager
 def naming(place: str | Path) -> Iterator[None]:
-    """Put a file, or a node, before the text of an error."""
+    """Prefix the text of an error with the name of a file or a node."""
     try:
         yield
     except ValueError as error:

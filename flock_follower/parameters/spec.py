@@ -143,7 +143,7 @@ CAMERA_NAMES = Spec(
 
 def specs_of(params: Checked, prefix: str = '') -> list[Spec]:
     """
-    Return a parameter for each field of ``params`` that a node declares, those of parts, too.
+    Return a parameter for each declared field of ``params`` and of its parts.
 
     :param params: its values are the defaults.
     :param prefix: of the parameters' names.
@@ -165,7 +165,7 @@ P = TypeVar('P', bound=Checked)
 
 def filled(params: P, values: Mapping[str, Any], prefix: str = '', **others: Any) -> P:
     """
-    Return ``params`` with the values of a node's parameters, those of its parts, too.
+    Return ``params`` and its parts with the values of a node's parameters.
 
     :param prefix: as in :func:`specs_of`.
     :param others: fields that are no parameters of a node.
@@ -194,7 +194,7 @@ def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, 
 
 def expanded(specs: Sequence[Spec], values: Mapping[str, Any]) -> list[Spec]:
     """
-    Return the parameters with those of every camera listed in place of ``camera.NAME...``.
+    Return the parameters, ``camera.NAME...`` replaced by those of each listed camera.
 
     :raises ValueError: if the list of names, among the values, is wrong.
     """
@@ -225,7 +225,7 @@ def _listed_cameras(values: Mapping[str, Any]) -> list[str]:
 
 def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> None:
     """
-    Refuse names that are no parameters of a node: ROS ignores them, and their values with them.
+    Refuse names that are no parameters of a node: ROS would ignore these names.
 
     :raises ValueError: naming the parameter, and the one that is nearest to it.
     """

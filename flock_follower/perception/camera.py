@@ -63,12 +63,12 @@ _RADIUS_LIMIT = 10.0
 
 
 def off_center(shares: Array) -> bool:
-    """Return whether the optical axis at shares (2,) of width and height is far off the middle."""
+    """Return whether the optical axis, as shares (2,) of the image size, is far off the middle."""
     return bool(np.abs(shares - 0.5).max() > MAX_AXIS_OFFSET)
 
 
 def marked_rectified(topic: str) -> bool:
-    """Return whether a topic's name says that its images are rectified, of any transport."""
+    """Return whether a topic's name marks its images as rectified, for any transport."""
     return bool({'rect', 'rectified'}.intersection(re.split('[/_]', topic.lower())))
 
 
@@ -274,7 +274,7 @@ class CameraModel:
         return xy
 
     def _normalized(self, points: Array) -> tuple[Array, Array]:
-        """Return (X/Z, Y/Z) (N, 2), NaN if it is not projected, and depths (N, 1), m."""
+        """Return (X/Z, Y/Z) (N, 2), NaN if a point is not projected, and depths (N, 1), m."""
         depth = points[:, 2:]
         if not depth.min(initial=1.0) > 1e-9:
             depth = np.where(depth > 1e-9, depth, np.nan)

@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-Decides which neighbors to look for in which camera's image, and how often to search whole images.
+Decides which neighbors each camera's image is searched for, and how often whole images are.
 
-With one camera, every neighbor is looked for in every image. With several, a neighbor that
-another camera has just seen is looked for only where it is expected inside, and without a search;
-less often if it was not found there.
-Each of n cameras searches whole images n times less often, so that more cameras cost no more.
+With one camera, every neighbor is looked for in every image. With several cameras, a neighbor that
+another camera has just seen is looked for only at its expected place in the image, without a
+search, and less often if it was not found there. Each of n cameras searches whole images n times
+less often, so the total cost does not grow.
 """
 
 from __future__ import annotations
@@ -78,15 +78,15 @@ class CameraSchedule:
         self._seen: dict[str, tuple[MountedCamera, float]] = {}
 
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
-        """Take that a camera measured a neighbor."""
+        """Record that a camera measured a neighbor."""
         self._seen[name] = camera, time
 
     def seen_last_by(self, name: str, camera: MountedCamera) -> bool:
-        """Return whether no other camera saw a neighbor since this one did."""
+        """Return whether no other camera has seen a neighbor since this camera saw it."""
         return self._seen.get(name, (camera, 0.0))[0] is camera
 
     def time(self, name: str, camera: MountedCamera, time: float) -> float:
-        """Return a time for a neighbor's filter: images taken at once have different ones."""
+        """Return a time for a neighbor's filter; those of simultaneous images differ."""
         last, seen = self._seen.get(name, (camera, time))
         return seen + STEP if last is not camera and abs(time - seen) < TOGETHER else time
 
@@ -134,11 +134,11 @@ class CameraSchedule:
         return max(math.floor(min(fitting, N_PORTIONS)), 1)
 
     def has_time_for_all(self, camera: MountedCamera) -> bool:
-        """Return whether the images come so rarely that one has time for all portions."""
+        """Return whether the image rate is so low that one image has time for all portions."""
         return camera.interval >= N_PORTIONS * PORTION_PERIOD
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
-        """Return whether to search the whole image of a stamp, s, although none is missing."""
+        """Return whether to search the whole image of a stamp, s, with no neighbor missing."""
         if camera.swept == -math.inf:
             camera.swept = stamp
         waited = min(abs(stamp - camera.searched), abs(stamp - camera.swept))

@@ -104,9 +104,9 @@ _CORRELATION = _correlation()
 
 class Found(NamedTuple):
     """
-    Where edges are in the image.
+    Positions of edges in the image.
 
-    ``offsets`` (n,), px: along the normals, from the predicted lines. ``found`` (n,), bool.
+    ``offsets`` (n,), px: from the predicted lines, along the normals. ``found`` (n,), bool.
     ``variance`` (n,), px^2: squared width (sigma^2) of each peak, from the blur and the kernel
     together. ``known``: the indices of the edges found across either axis.
     """
@@ -122,7 +122,7 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
     """
     Return where brightness rises most steeply along each line's normal.
 
-    None if too few edges, or too faint ones, are there. ``spacing``, px, between samples
+    None if too few edges are found, or too faint edges. ``spacing``, px, between samples
     across edges of either axis; ``bloom`` (2,), px, as far as it is known.
     """
     model, pixels, swollen = lines.model, lines.pixels, None
@@ -157,7 +157,7 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
 
 def _separate_edges(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     """
-    Return where edges are without the shifts by their neighbors, and the blur of either axis, px.
+    Return the edges without the shifts by adjacent edges, and the blur of each axis, px.
 
     Blurred by s in all, an edge at 0 and its opposite at d give the smoothed derivative
     C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
@@ -198,7 +198,7 @@ def _match_spacing(lines: Lines, blur: list[float]) -> tuple[float, float]:
 
 
 def _widen_for_bloom(spacing: tuple[float, float], bloom: Array) -> tuple[float, float]:
-    """Return the spacing, px, with which edges are within reach although bloom shifts them."""
+    """Return the spacing, px, with which profiles reach edges that bloom has shifted."""
     first, second = (each + shift / _HALF_WIDTH if shift > MAX_PLAIN_BLOOM else each
                      for each, shift in zip(spacing, np.abs(bloom).tolist()))
     return first, second
@@ -332,7 +332,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
 
 def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
                spacing: tuple[float, float], blur: list[float]) -> EdgeFit | None:
-    """Return the fit that ends with a step, None if it is poor or leaves a direction open."""
+    """Return the fit after the last step; None if it is poor or a direction is undetermined."""
     if not (last.weights.dot(lines.model.bloom) < -_MIN_AXIS_SHARE * lines.model.counts).all():
         return None
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
@@ -401,5 +401,5 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
 
 
 def _robust(squares: Array) -> float:
-    """Return the variance of which most of the squares (n,) are, by their median."""
+    """Return the variance of most residuals, from the median of their squares (n,)."""
     return 1.4826**2 * median(squares) if len(squares) else 1.0

@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-The edges of a neighbor's markers in an image, as a pose projects them; normal equations.
+The edges of a neighbor's markers, projected to the image by a pose; normal equations.
 
 ``solve_normal`` and ``normal_covariance`` serve every fit. Both solve normal equations of least
 squares by Cholesky, and only if the equations determine every unknown: Gaussian elimination also
 answers equations that only rounding keeps from being singular, and their inverse is no covariance.
 
-The arrays are small: the number of operations takes time, not the number of points. ``dot`` takes
+The arrays are small, so the time depends on the number of operations, not of points. ``dot`` takes
 half as long as ``@``.
 """
 
@@ -85,7 +85,7 @@ def normal_covariance(information: Array) -> Array | None:
 
 
 def moved(pose: Transform, center: Array, step: Array) -> Transform:
-    """Return a pose after a step (6,) or more of a point: its translation, and a turn about it."""
+    """Return a pose after a step (6,) or longer: translation of a point, and rotation about it."""
     turn = rotation_vector_to_matrix(step[3:6])
     return Transform(turn.dot(pose.rotation),
                      center + step[:3] + turn.dot(pose.translation - center))
@@ -93,7 +93,7 @@ def moved(pose: Transform, center: Array, step: Array) -> Transform:
 
 class Lines(NamedTuple):
     """
-    Edges in the image as a pose has them.
+    Edges in the image, projected by a pose.
 
     ``pixels`` and ``normals`` (n, 2), px, unit, from black to white; ``design`` (n, 8): the motion
     of each edge along its normal, px, by a step of ``center`` (3,), m, a turn about it, rad, and
@@ -111,7 +111,7 @@ class Lines(NamedTuple):
 
     @property
     def narrowest(self) -> tuple[float, float]:
-        """Return how far apart the closest edges across either axis are, px."""
+        """Return the least distance of two edges along each axis, px."""
         (across_x, across_y), (x, y) = self.model.narrowest, self.scale
         return across_x * x, across_y * y
 
@@ -122,7 +122,7 @@ class Lines(NamedTuple):
 
 
 def facing(model: EdgeModel, pose: Transform) -> Any:
-    """Return which markers turn their front to the camera, less than 80 degrees aside, (m,)."""
+    """Return which markers face the camera, with an angle below 80 degrees, (m,)."""
     if not has_converged(pose):
         return np.zeros(len(model.centers), dtype=bool)
     sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
@@ -137,7 +137,7 @@ def has_converged(pose: Transform) -> bool:
 
 def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | None:
     """
-    Return the edges as a pose, ``T_camera_body``, has them; None if the lens does not see all.
+    Return the edges by a pose, ``T_camera_body``; None if the lens does not see all of them.
 
     All markers of the model must face the camera.
     """

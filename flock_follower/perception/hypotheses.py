@@ -82,7 +82,7 @@ class _Motion:
         self._since, self._place = -math.inf, (0.0, 0.0, 0.0)
 
     def take(self, time: float, place: Array) -> None:
-        """Take where it is (3,), m."""
+        """Take its position (3,), m."""
         x, y, z = place.tolist()
         if not 0.0 <= time - self._since <= WINDOW:
             self._since, self._place = time, (x, y, z)
@@ -96,12 +96,12 @@ class Candidate:
     number: int
     track: NeighborFilter
     reachable: bool
-    """Whether the primary track could have reached its first place."""
+    """Whether the primary track could have reached the candidate's first place."""
     motion: _Motion = field(default_factory=_Motion)
     measured: int = 0
-    """Measurements taken in."""
+    """Number of accepted measurements."""
     alone: int = 0
-    """Measurements since the last one of the primary track."""
+    """Number of measurements since the last measurement of the primary track."""
     beside: bool = False
     """Whether the primary track was ever measured in the same image."""
 
@@ -116,7 +116,7 @@ class Candidate:
         return -math.inf if self.track.newest is None else self.track.newest.stamp
 
     def distance(self, time: float, place: Array) -> float:
-        """Return how far a place (3,), m, is from where it is expected, m."""
+        """Return the distance of a place (3,), m, from the candidate's expected place, m."""
         expected = self.track.place(time) or (self.track.newest and self.track.newest.pose)
         return math.inf if expected is None else math.dist(place, expected.translation)
 
@@ -157,7 +157,7 @@ class Hypotheses:
         self._motion = _Motion()
         self._measured = 0  # measurements of the primary track since it started
         self._lost: Array | None = None
-        """Where the primary track was before it restarted (3,), m; None if it did not."""
+        """Position (3,), m, of the primary track before its restart; None without a restart."""
         self.candidates: list[Candidate] = []
 
     @property
@@ -221,7 +221,7 @@ class Hypotheses:
 
     def _update_primary(self, time: float, measured: Transform, reference: Array,
                         covariance: Array, alike: Array | None) -> UpdateOutcome:
-        """Update the primary track with a measurement, if it can be of it."""
+        """Update the primary track with a measurement, if both can be of one body."""
         last, reach = self.primary.newest, self._reach(time)
         if last is not None and time > last.stamp and self.primary.place(time) is None and (
                 math.dist(measured.translation, last.position) > reach):
@@ -240,7 +240,7 @@ class Hypotheses:
         return outcome
 
     def _reach(self, time: float) -> float:
-        """Return how far from its newest place the primary track can be, m."""
+        """Return the largest possible distance of the primary track from its last place, m."""
         last = self.primary.newest
         return RESTART_TOLERANCE if last is None else (
             RESTART_TOLERANCE + self.params.leader_speed_max * max(time - last.stamp, 0.0))

@@ -87,7 +87,7 @@ def _png_size(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Return the size in the frame header; before it come segments that begin with a length."""
+    """Return the size in the frame header; earlier segments begin with their length."""
     start = len(_JPEG)
     while start + 9 <= len(data) and data[start] == _JPEG_FILL:
         marker = data[start + 1]
@@ -139,7 +139,7 @@ _ENCODINGS |= {wide: (2 * _ENCODINGS[narrow][0], _ENCODINGS[narrow][1])
 
 
 def compute_in_one_thread() -> None:
-    """Keep OpenCV to the calling thread: to wake others cost 6 % of a core, and gained nothing."""
+    """Restrict OpenCV to the calling thread: other threads cost 6 % of a core without a gain."""
     cv2.setNumThreads(1)
 
 

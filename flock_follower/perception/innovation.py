@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Innovations of a filter: their covariance and size, and errors that are alike from image to image.
+Innovations of a filter: covariance, size, and errors that are correlated between images.
 
 A smear, a reflex or over-exposure lasts for several images, and so does the error of a pose that
 is measured in them: the mean of ten such images is hardly better than one. The filter considers
@@ -43,7 +43,7 @@ class AlikeErrors:
         self._age = 0.0  # since the last measurement that has such errors, s
 
     def pass_on(self, dt: float, transition: Array) -> None:
-        """Move on by dt, s, over which the error state has a transition (15, 15)."""
+        """Predict over dt, s, with the transition (15, 15) of the error state."""
         self._age += dt
         if self.cross is not None:
             self.cross = math.exp(-dt / ALIKE_TIME) * transition.dot(self.cross)
@@ -69,7 +69,7 @@ class AlikeErrors:
 
 
 def root_of(covariance: Array) -> Array:
-    """Return the symmetric root (n, n) of a covariance (n, n): it turns little as that does."""
+    """Return the symmetric root (n, n) of a covariance (n, n); it changes continuously."""
     values, vectors = np.linalg.eigh(covariance)
     root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))).dot(vectors.T)
     return root

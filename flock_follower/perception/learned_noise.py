@@ -15,9 +15,9 @@
 """
 Noise learned from innovations in flight: of the measurements, and of a neighbor's motion.
 
-If both are right, the innovations of a Kalman filter are white, of the expected covariance. An
-unmodeled motion makes successive innovations alike. An error of the measurements, white from
-image to image, does not. So half the square of the difference of two successive innovations shows
+If both are right, the innovations of a Kalman filter are white, of the expected covariance.
+Unmodeled motion correlates successive innovations. White measurement noise does not. So half the
+square of the difference of two successive innovations shows
 the noise of the measurements, and their mean over ``MEAN_TIME`` shows the motion (Mehra, "On the
 identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control, 1970).
 

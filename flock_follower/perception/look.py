@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One image on its way through perception: the expected and the found content.
+One image in perception: its expected content, and the content that was found.
 
 ``CameraMotion`` is the camera's pose and motion at the time of an image, or of one of its rows. A
 rolling shutter exposes row r of an image of height h r / h * readout_time after the first row. A
@@ -58,7 +58,7 @@ _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 class CameraMotion(NamedTuple):
     """
-    The own state at that time, and the camera's pose in the smooth frame of ``OdometryBuffer``.
+    The ego state at the exposure, and the camera's pose in ``OdometryBuffer``'s smooth frame.
 
     ``rotation`` (3, 3) takes the body to odom.
     """
@@ -244,7 +244,9 @@ class Look:
 
     stamp: float
     exposed: float
-    """When its middle row was exposed, by the camera's clock, s; ``view`` is of that time."""
+    """
+    Time of the exposure of the middle row by the camera's clock, s; ``view`` is of this time.
+    """
     camera: MountedCamera
     model: CameraModel
     view: CameraMotion
@@ -262,7 +264,7 @@ class Look:
 
     def confirmed(self, image: GrayImage, found: Measurement, sought: Target,
                   dictionary: str) -> Measurement:
-        """Return a measurement of a neighbor, or what its detected marker shows instead."""
+        """Return a measurement of a neighbor, or the fault of its detected marker."""
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
             recent = self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD
@@ -283,7 +285,7 @@ class Look:
         return found
 
     def distance(self, measurement: Measurement) -> float:
-        """Return how far a body is from where its neighbor is expected, or from the camera, m."""
+        """Return a body's distance from the neighbor's expected place, or from the camera, m."""
         expected = self.expected[measurement.name].pose
         place = np.zeros(3) if expected is None else expected.translation
         return math.dist(measurement.T_camera_body.translation, place)

@@ -61,7 +61,7 @@ class Hypothesis(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The likeliest pose and its lead in chi^2; the other one, if any, and its probability."""
+    """The most likely pose and its lead in chi^2; the other pose, if any, and its probability."""
 
     chosen: Hypothesis
     margin: float

@@ -15,8 +15,9 @@
 """
 Estimates a neighbor's position, velocity, attitude and acceleration: a Kalman filter in odom.
 
-The state is in odom, not relative to the own vehicle: own maneuvers do not look like those of the
-neighbor, and slow drift of the odometry moves both alike. ``neighbor_motion`` has the motion
+The state is in odom, not relative to the ego vehicle: ego maneuvers do not appear as maneuvers of
+the neighbor, and slow drift of the odometry displaces both equally. ``neighbor_motion`` has the
+motion
 model and the state.
 
 A measurement is the position of a point on the body, where its markers are, and the attitude.
@@ -132,7 +133,9 @@ class NeighborFilter:
     def reset(self) -> None:
         """Forget the neighbor."""
         self.change: Change | None = None
-        """Of the newest measurement; None if it was not used, or if it began the track."""
+        """
+        Innovation change of the newest measurement; None if unused, or if it began the track.
+        """
         self.newest: Estimate | None = None
         """The state at the newest measurement; None if there is no track."""
         self._predicted: Estimate | None = None  # from that, to the time last requested
@@ -146,7 +149,7 @@ class NeighborFilter:
 
     def predict(self, stamp: float) -> Estimate | None:
         """
-        Return the state expected at a stamp, s, or None if no track reaches there.
+        Return the state predicted for a stamp, s; None without a track, or if it is too old.
 
         The filter itself is not altered. A stamp before the newest measurement gives None.
         """
@@ -167,7 +170,7 @@ class NeighborFilter:
         return Transform(now.rotation, now.position + (stamp - now.stamp) * now.velocity)
 
     def near(self, stamp: float) -> Estimate | None:
-        """Return the state at a stamp, s, a little before or after the newest measurement."""
+        """Return the state at a stamp, s, shortly before or after the newest measurement."""
         now = self.newest
         if now is None or stamp == now.stamp:
             return now
@@ -363,7 +366,7 @@ class NeighborFilter:
         return UpdateOutcome.USED if factors == (1.0, 1.0) else UpdateOutcome.SURPRISING
 
     def _surprises_again(self, quantity: str, innovation: Array, doubt: float) -> bool:
-        """Return whether an innovation (3,) surprises for the second time in one direction."""
+        """Return whether two successive innovations (3,) exceed the gate in the same direction."""
         before = self._surprises.pop(quantity, None)
         if doubt <= 1.0:
             return False

@@ -185,7 +185,7 @@ def motion(dt: float, params: FilterParams) -> tuple[Array, Array]:
 
     Singer's transition is exact. Its noise is that of white jerk of the same density, which it
     tends to for a time constant much longer than dt.
-    A negative dt goes back, and adds as much.
+    A negative dt predicts backwards, and adds the same noise.
     """
     T, x = params.acceleration_time, dt / params.acceleration_time
     decay = math.exp(-x)
@@ -225,7 +225,7 @@ def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
 
 def turned_along(covariance: Array, before: Array, now: Array) -> Array:
     """
-    Return a covariance (15, 15) turned from one line to another.
+    Return a covariance (15, 15) rotated from one line to another.
 
     If only its distance is known, a neighbor may be anywhere on a sphere. If the line to its
     likeliest place turns, from ``before`` to ``now``, unit vectors (3,), the covariance turns with

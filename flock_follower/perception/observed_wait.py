@@ -36,13 +36,13 @@ class ObservedWait:
 
     @property
     def limit(self) -> float:
-        """Return for how long to wait now, s."""
+        """Return the present limit of the wait, s."""
         if len(self._waits) < self._needed:
             return self._max_wait
         return min(self._factor * max(self._waits) + LATE_MARGIN, self._max_wait)
 
     def observe(self, waited: float) -> None:
-        """Take a wait that ended with the awaited message, s."""
+        """Record the length of a wait that ended with the awaited message, s."""
         self._waits.append(waited)
 
     def forget(self) -> None:

@@ -53,7 +53,7 @@ JUMPED = ('time jumped back', 'every track starts anew')
 
 class PendingImage(NamedTuple):
     """
-    An image message, when it came (s, any clock), its stamp in ns and s, and its camera.
+    An image message, its time of arrival (s, any clock), its stamp in ns and s, its camera.
 
     ``model``, from :meth:`Perceiver.process`: the calibration; None as long as no usable one came.
     """
@@ -82,7 +82,7 @@ class Processed(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Return whether calibration, odometry and image were there to look for neighbors."""
+        """Return whether calibration, odometry and image were available for a search."""
         return not any(reason in _UNUSABLE for reason, _ in self.sighting.rejections)
 
 
@@ -118,7 +118,7 @@ class Perceiver:
 
     @property
     def overdue(self) -> float | None:
-        """Return when a waiting image will not wait any longer, s, or None."""
+        """Return the time at which the wait of an image ends, s, or None."""
         return min((image.received + self._wait.limit for image in self._pending), default=None)
 
     def model(self, camera: str = '') -> CameraModel | None:
@@ -189,7 +189,7 @@ class Perceiver:
         return self._pending.pop(0) if len(self._pending) > most else None
 
     def _stand_still(self, image: PendingImage) -> None:
-        """Take the camera itself as the origin at the stamp of an image."""
+        """Set the camera as the origin at the stamp of an image (``odometry: none``)."""
         header = getattr(image.message, 'header', None)
         self.frame = self._cameras[image.camera].frame if header is None else header.frame_id
         rest = np.zeros(3)
@@ -243,11 +243,11 @@ class Perceiver:
         return True
 
     def take_range(self, measured: RangeState) -> Rejection | None:
-        """Take a range, or return why not; it is used by ``tracker.ranging.due``."""
+        """Take a range for ``tracker.ranging.due``; return why it is refused, or None."""
         return self.tracker.ranging.take(measured, self._seconds(measured.stamp))
 
     def take_pose(self, name: str, state: PoseState, now: float) -> Rejection | None:
-        """Take a pose by another detector, or return why not; ``sources.due`` uses it."""
+        """Take another detector's pose for ``sources.due``; return why it is refused, or None."""
         return self.sources.take(name, state, self._seconds(state.stamp), now, self.frame)
 
     def take_frame(self, stamp: int, now: float) -> None:
@@ -282,7 +282,7 @@ class Perceiver:
                 yield topic, pose_with_covariance(make, image.stamp_ns, frame, *measured)
 
     def _seconds(self, nanoseconds: int) -> float:
-        """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""
+        """Return the seconds since the first stamp: small floats resolve a nanosecond."""
         if self._epoch is None:
             self._epoch = nanoseconds
         return (nanoseconds - self._epoch) * 1e-9

@@ -106,7 +106,7 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           last: Measurement | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return a neighbor close to where it is expected, or None if its markers are not there.
+    Return a neighbor near its expected place, or None if its markers are not there.
 
     :param last: its last measurement, if any: if its print was smeared, edges are looked for only
         if it is so no longer.
@@ -186,7 +186,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
            expected: PosePrior, smeared: bool = True) -> Measurement | None:
     """
-    Return a neighbor one of whose markers was detected, or None if no pose suits it.
+    Return a neighbor with a detected marker, or None if no pose fits the marker.
 
     :param index: of the marker among the neighbor's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
@@ -213,7 +213,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
                    starts: list[Transform], expected: PosePrior) -> Measurement | None:
-    """Return a neighbor by the whole print of a detected marker, smeared."""
+    """Return a neighbor by a fit of the whole smeared print of a detected marker."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
     if len(fits) == 1:
@@ -256,7 +256,7 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
 
 
 def _plain(found: EdgeFit) -> bool:
-    """Return whether edges have no errors that last: by a smear, over-exposure or a reflex."""
+    """Return whether the edges have no lasting errors by smear, over-exposure or reflexes."""
     return (found.blur < PLAIN_BLUR and found.bloom < MAX_PLAIN_BLOOM
             and found.inliers > PLAIN_INLIERS)
 
@@ -267,7 +267,7 @@ def _sharp(found: EdgeFit) -> bool:
 
 def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
                   near: bool) -> list[tuple[int, SmearStart]]:
-    """Return where the prints of the markers that face the camera resemble the image."""
+    """Return the places at which prints that face the camera resemble the image."""
     found = ((k, seek(image, camera, sought.smears[k], pose, near))
              for k in np.flatnonzero(facing(sought.model, pose)).tolist())
     return [(k, start) for k, start in found if start is not None]
@@ -275,7 +275,7 @@ def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: T
 
 def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
                starts: list[tuple[int, SmearStart]]) -> _Whole | None:
-    """Return the fit to the first marker whose print is smeared as it starts, or None."""
+    """Return the fit to the first marker whose smeared print fits the image, or None."""
     for k, start in starts:
         found = descend(image, camera, sought.smears[k], start)
         if found is not None:
@@ -305,7 +305,8 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
     """
     Return the measurement of the likelier of one or both attitudes of a smeared marker.
 
-    The image decides so little that the expected attitude would confirm itself: it has no vote.
+    The image says little about the attitude, so the expected attitude is not used: it would
+    confirm itself.
     """
     least = min(each.rms for each in fits)
     best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
@@ -314,7 +315,7 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
 
 
 def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Measurement:
-    """Return the measurement of a smeared marker whose mirrored attitude is as likely as last."""
+    """Return a smeared marker's measurement; the mirrored attitude keeps its last probability."""
     pose = found.fit.pose
     measurement = _smear_measurement(sought, found.number, found.fit)
     other = _mirrored_body(sought, found.number, pose)

@@ -77,7 +77,7 @@ class Sourced(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """A pose that waits for odometry of its stamp, s, and when it came, s."""
+    """A pose that waits for odometry of its stamp, s, and its time of arrival, s."""
 
     stamp: float
     name: str
@@ -89,7 +89,7 @@ class _Waiting(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """The stamp of an image, s and ns, and when its message came, s."""
+    """The stamp of an image, s and ns, and the arrival of its message, s."""
 
     stamp: float
     stamp_ns: int
@@ -216,7 +216,7 @@ class PoseSources:
         return known if known is not None else self.static.pose(frame, BASE)
 
     def _observe_latency(self, each: _Waiting) -> None:
-        """Learn how long after its frame a pose comes; pass that frame and those before on."""
+        """Learn the delay from a frame to its pose; pass on this frame and earlier frames."""
         for frame in self._recent:
             if abs(frame.stamp - each.stamp) < SAME_IMAGE:
                 self._wait.observe(max(each.received - frame.received, 0.0))

@@ -211,7 +211,7 @@ def _few_wrong(agreeing: Array, brightness: Array, code: CellCode, tracked: bool
 
 
 def _wrong(agreeing: Array) -> float:
-    """Return how many cells, of agreement (n,), are wrong; doubtful ones count in part."""
+    """Return the number of wrong cells by their agreement (n,); doubtful cells count in part."""
     return float(np.clip(0.5 - agreeing, 0.0, 1.0).sum())
 
 
@@ -269,8 +269,8 @@ class EdgeModel:
 
     ``places`` (n + c, 3) are the points, then the middles of the markers' cells. ``tangents``
     (n, 3), unit, have black on the left and white on the right as one faces the marker.
-    ``axis`` (n,) is 0 for edges across the marker's x axis, 1 across y. ``room`` (n, 2) is how far
-    the next edge is on the black side, and on the white side, m. ``marker`` (n,) and
+    ``axis`` (n,) is 0 for edges across the marker's x axis, 1 across y. ``room`` (n, 2): distance
+    to the next edge on the black side and on the white side, m. ``marker`` (n,) and
     ``cell_marker`` (c,) are the index of the marker. Per marker: ``centers`` and ``facings``
     (m, 3), its middle and its normal, and ``codes``.
     """

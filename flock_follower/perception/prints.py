@@ -117,13 +117,13 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
 
 
 def border_sought(rounds: int) -> int:
-    """Return the border, cells, to search for if so many whole images were searched before."""
+    """Return the border, cells, to search for after a number of whole images searched."""
     which = rounds % _ROUNDS
     return BORDER_WIDTHS[which if which < len(BORDER_WIDTHS) else 0]
 
 
 def lean(R_camera_body: Array, up: Array) -> float:
-    """Return by how much a body leans, rad; ``up`` (3,) as in ``PosePrior``."""
+    """Return the tilt of a body, rad; ``up`` (3,) as in ``PosePrior``."""
     return math.acos(min(max(float(R_camera_body[:, 2] @ up), -1.0), 1.0))
 
 

@@ -78,7 +78,7 @@ _MOST_READ = 6
 def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: MarkedNeighbor,
          expected: Transform, thorough: bool) -> Detections:
     """
-    Return the markers about where a neighbor is expected (``T_camera_body``).
+    Return the markers near the expected pose of a neighbor (``T_camera_body``).
 
     :param thorough: whether to search thoroughly, for the neighbor's own markers.
     """
@@ -153,7 +153,7 @@ def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, d
 
 def _read(image: GrayImage, dictionary: str, markers: Sequence[Marker],
           windows: Sequence[tuple[int, int]]) -> Detections:
-    """Return the given markers in an image, the likest outline first."""
+    """Return the given markers in an image, the most similar outline first."""
     logarithm = cv2.LUT(image, _LOGARITHM)
     outlines = outwards(quadrilaterals(logarithm, windows), 0.5)
     if not len(outlines):
@@ -210,7 +210,7 @@ def _from_square(outlines: Array) -> Array:
 
 
 def _local(brightness: Array) -> Array:
-    """Return how much squares of cells (n, c) differ from the cells around each, of norm 1."""
+    """Return the difference of each cell of squares (n, c) from its surroundings, of norm 1."""
     differs = brightness.astype(float).dot(_differences(math.isqrt(brightness.shape[1])))
     normalized: Array = differs / np.maximum(
         np.linalg.norm(differs, axis=1, keepdims=True), 1e-6)

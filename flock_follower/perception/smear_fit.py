@@ -147,7 +147,7 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
 def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
          start: Transform, near: bool = False) -> SmearStart | None:
     """
-    Return the pose, shifted, smear and blur with which the print is likest to the image.
+    Return the shifted pose, smear and blur with which the print correlates best.
 
     ``start`` may be off by two cells and a half. None if the image resembles the print nowhere.
 
@@ -212,7 +212,7 @@ def _basis(pose: Transform, model: SmearModel) -> Array:
 
 
 def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) -> _Seen | None:
-    """Return what an image shows at places (3, s) on a marker; None if too few are in it."""
+    """Return the brightness at places (3, s) on a marker; None if too few are in the image."""
     points = places.T.dot(basis.T)
     if not points[:, 2].min() > _MIN_DEPTH:
         return None
@@ -268,7 +268,7 @@ class _Descent(NamedTuple):
 
 def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
             start: SmearStart) -> SmearFit | None:
-    """Return the fit at the least weighted squares near a pose and a smear."""
+    """Return the fit with the least weighted squares near a pose and a smear."""
     pose, smear, lens = start
     weights, variance, response = np.ones(model.places.shape[1]), _MIN_VARIANCE, None
     for count in range(_MAX_PASSES):
@@ -404,7 +404,7 @@ def _check_fit(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit |
 
 
 def _shows_code(model: SmearModel, end: SmearStart, last: _Descent) -> bool:
-    """Return whether no word suits the image better, and few cells were better turned."""
+    """Return whether no other code fits the image better, and few cells fit better inverted."""
     instants = instants_of(end.smear, LENS_BLURS[end.lens])[:, None]
     inner, count = model.cells - 2, model.places.shape[1]
     column, row = (np.rint(place + instants * along).astype(np.intp)

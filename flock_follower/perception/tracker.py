@@ -178,7 +178,7 @@ class Tracker:
         return jumped
 
     def missing(self, stamp: float, camera: str = '') -> Missing | None:
-        """Return why an image of this stamp, s, cannot be processed yet, or None."""
+        """Return why an image of a stamp, s, cannot be processed yet, or None."""
         source = self.cameras[camera]
         last = stamp + source.time_offset.applied + source.readout_time
         return self._odometry.missing(last, extrapolate=False)
@@ -199,7 +199,7 @@ class Tracker:
 
     def wanted(self, stamp: float, model: CameraModel, camera: str = '') -> bool:
         """
-        Return whether to process the image of a stamp, s: else it need not even be decoded.
+        Return whether to decode and process the image of a stamp, s.
 
         With one camera always; with several cameras, only if a neighbor may be in the image.
         """
@@ -335,7 +335,7 @@ class Tracker:
             unchecked[name] -= 1
 
     def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
-        """Return in how many images the mirrored attitude need not be looked at again."""
+        """Return the number of images until the mirrored attitude is checked again."""
         assert found.margin is not None
         if found.spacing is not None:
             return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
@@ -391,7 +391,7 @@ class Tracker:
         look.sighting.stage, camera.searched = 'full', look.stamp
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look) -> None:
-        """Turn detections that are not measured yet into measurements."""
+        """Fit poses to the detections that have no measurement yet."""
         located = []
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
             if marker_id not in self._by_marker:

@@ -165,7 +165,7 @@ def in_sight(it: Prediction, position: Sequence[float], velocity: Sequence[float
 
 def stop(along: Sequence[float], left: float, velocity: Sequence[float],
          params: PlannerParams) -> Bound:
-    """Return the bound that stops the vehicle along a unit vector within ``left`` m."""
+    """Return the bound with which the vehicle stops along a unit vector within ``left`` m."""
     guarding, rate = params.guarding, scalar_product(along, velocity)
     # Until the command acts the vehicle keeps its velocity.
     speed, slope = guarding.closing_speed(left - max(rate, 0.0) * params.response_time,

@@ -89,9 +89,9 @@ def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
     """
     Return all bounds in the order of their importance.
 
-    Separation from those in sight comes first, the nearest neighbor before the others; then
-    fences, separation from those out of sight, and sight; last cohesion, the farthest first. So
-    cohesion never costs separation or sight.
+    Order: separation from neighbors in sight (the nearest first), fences, separation from
+    neighbors out of sight, sight, cohesion (the farthest first). So cohesion never relaxes
+    separation or sight.
     """
     near = sorted(bounds, key=lambda each: each.distance)
     apart = [each for each in near if each.reason == SEPARATION]
@@ -103,11 +103,11 @@ def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
 def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 params: PlannerParams) -> tuple[float, float]:
     """
-    Return the least and the greatest vertical speed, m/s, beside those in sight.
+    Return the least and greatest vertical speed, m/s, that neighbors in sight permit.
 
-    Above or below a neighbor that is too near horizontally no horizontal command helps: the height
-    between does not shrink. From one that is near and approaches the vehicle backs away first: the
-    climb gets the rest of ``v_max``.
+    If a neighbor is too near horizontally, above or below, the height difference does not shrink.
+    If a neighbor is near and approaches, the retreat has priority, and the climb gets the rest of
+    ``v_max``.
     """
     edges, least, most = params.edges, -math.inf, math.inf
     rest, here = math.inf, me.position.tolist()
@@ -140,7 +140,7 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
 
 def fences(lost: Loss | None, position: Array, velocity: Array,
            params: PlannerParams) -> list[Bound]:
-    """Return the bounds on motion without sight of the lost neighbor."""
+    """Return the bounds on motion while the lost neighbor is out of sight."""
     if lost is None:
         return []
     # The full m in a narrow band, too: nothing beyond the last line of sight was seen free.
@@ -157,7 +157,7 @@ def fences(lost: Loss | None, position: Array, velocity: Array,
 def limit_to_retreat(bound: Bound, lost: Loss, position: Array, velocity: Sequence[float],
                      params: PlannerParams, sideways: bool = True) -> Bound:
     """
-    Return the bound of one out of sight, limited to the retreat.
+    Return the bound for a neighbor out of sight, limited by the retreat.
 
     :param sideways: whether it is the lost neighbor itself: the vehicle leaves its path.
     """
@@ -179,8 +179,8 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     """
     Return the largest retreat from a neighbor out of sight, m.
 
-    A leader is no faster than ``v_max``: the slower the vehicle may be, the shorter it retreats.
-    The retreat is shorter by the distance beyond the band at the loss, too.
+    The leader is assumed to be no faster than ``v_max``, so a lower ``v_max`` shortens the
+    retreat. The retreat is shorter by the distance beyond the band at the loss.
     """
     distance = lost.free - float(lost.towards @ lost.origin)
     beyond = max(distance - math.sqrt(params.law.d1), 0.0)
@@ -201,8 +201,8 @@ def fallback_retreat_velocity(memory: Memory, scene: Scene,
     Return the velocity (3,), m/s, that keeps the distance to an approaching neighbor, or None.
 
     The gate brakes to it if odometry is lost. Of several approaching neighbors the nearest counts.
-    As out of sight, a neighbor that will approach in TRUSTED_TIME counts, too, and the retreat has
-    a limit.
+    A neighbor that will approach in TRUSTED_TIME counts, too, and the retreat is limited, as for a
+    neighbor out of sight.
     """
     if not params.guard or params.retreat_max == 0.0:
         return None
@@ -283,7 +283,7 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
 
 
 def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> float:
-    """Return the speed, m/s, by which drag makes the predicted speed too high."""
+    """Return the error, m/s, of the predicted speed that drag causes."""
     speed = math.hypot(*velocity.tolist())
     slower = params.response_time * float(memory.drag @ velocity) / speed if speed > 0.0 else 0.0
     return min(max(slower, 0.0), DRAG_SHARE * params.v_max)
@@ -312,7 +312,7 @@ def _is_covered(it: Prediction, scene: Scene) -> bool:
     """
     Return whether a lost neighbor is expected behind one in sight, on the line of sight.
 
-    It comes no nearer unseen than that one, whose own bound holds.
+    A covered neighbor comes no nearer than the visible one, which has its own bound.
     """
     sight = np.subtract(it.position, scene.me.position)
     distance = math.hypot(*sight.tolist())
@@ -327,7 +327,7 @@ def _is_covered(it: Prediction, scene: Scene) -> bool:
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequence[float],
                      here: bool, params: PlannerParams) -> list[Bound]:
-    """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
+    """Return the bounds for one neighbor; ``here``: it is in sight or received, not lost."""
     me, neighbors = scene.me, scene.neighbors
     age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
@@ -355,7 +355,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
 
 
 def _hover_place(n: Neighbor, params: PlannerParams) -> Prediction:
-    """Return the place where a follower that fell silent hovers, if its computer has failed."""
+    """Return the hover position of a silent follower whose computer may have failed."""
     along = n.velocity / max(math.hypot(*n.velocity.tolist()), SHORTEST)
     stops = FAILING_TIME * n.velocity + 0.5 * float(n.velocity @ n.velocity) / (
         STOP_SHARE * params.strongest) * along
@@ -365,7 +365,7 @@ def _hover_place(n: Neighbor, params: PlannerParams) -> Prediction:
 
 
 def _pass_beside(away: Sequence[float]) -> list[float]:
-    """Return a unit vector between away from a place and across: to pass beside it."""
+    """Return a unit vector between "away from a place" and "across", to pass beside it."""
     x, y, _ = away
     return [math.sqrt(0.5) * (x - y), math.sqrt(0.5) * (y + x), 0.0]
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Inputs of the planner: own odometry and neighbors, their validity, and their prediction.
+Inputs of the planner (ego odometry and neighbors): their validity and prediction.
 
 Nothing here reads a clock. The assumptions about a neighbor at the time when a command acts:
 
@@ -51,7 +51,7 @@ class OwnState(NamedTuple):
     velocity: Array
     yaw: float
     ages: tuple[float, ...] = ()
-    """Ages, s, at which the messages before it were replaced; () if unknown."""
+    """Ages, s, of earlier messages when the next message replaced them; () if unknown."""
     relative: bool = False
     """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
 
@@ -184,12 +184,12 @@ class Prediction(NamedTuple):
     spreading: float
     """... and its growth rate, m/s."""
     later: list[float]
-    """Velocity in TRUSTED_TIME, if the acceleration lasts so long (3,), m/s."""
+    """Velocity after TRUSTED_TIME if the acceleration lasts (3,), m/s."""
 
 
 def predict(n: Neighbor, acceleration: Sequence[float], age: float,
             params: PlannerParams) -> Prediction:
-    """Return the prediction of a neighbor whose estimate is of an age, s."""
+    """Return the prediction of a neighbor from an estimate of an age, s."""
     velocity = n.velocity.tolist()
     size = math.hypot(*acceleration)
     if not size <= TRUSTED_ACCELERATION:

@@ -85,7 +85,7 @@ class PlannerLoop:
         """
         Request commands, or end the request.
 
-        A repeated request changes nothing, except after the planner had given up.
+        A repeated request changes nothing, unless the planner has given up.
         """
         self.engaged, self._disengaged_by = requested, ''
         self._interrupted |= not requested or self.memory.given_up
@@ -166,9 +166,9 @@ class PlannerLoop:
 
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """
-        Note, at a time in ns, that perception has processed the image of a stamp, ns.
+        Record at a time, ns, that perception has processed the image of a stamp, ns.
 
-        Return whether the stamp is new: a frozen camera repeats one, and counts as no camera.
+        Return whether the stamp is new: a frozen camera repeats a stamp, and counts as no camera.
         """
         if self._frames and stamp == self._frames[-1]:
             return False
@@ -179,7 +179,7 @@ class PlannerLoop:
         return True
 
     def seconds(self, nanoseconds: int) -> float:
-        """Return seconds since the first tick: near zero, floats resolve a nanosecond."""
+        """Return the seconds since the first tick: small floats resolve a nanosecond."""
         return (nanoseconds - (self._epoch or 0)) * 1e-9
 
     def distance(self) -> tuple[str, float] | None:

@@ -121,7 +121,7 @@ class Memory(NamedTuple):
     own: OwnState | None = None
     neighbors: Mapping[str, Neighbor] = NONE
     flock: Mapping[str, Neighbor] = NONE
-    """The neighbors at hand and those lost since: to keep clear of."""
+    """The present neighbors and the lost ones, from which the follower keeps clear."""
     ranged: Mapping[str, Neighbor] = NONE
     """The neighbors of which only the distance is known at present."""
     motions: Mapping[str, Motion] = NONE
@@ -130,11 +130,11 @@ class Memory(NamedTuple):
     """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
     edges: frozenset[str] = frozenset()
     faced: str = ''
-    """The neighbor that it faced then."""
+    """The neighbor faced in the last step with a followed neighbor."""
     leader: Neighbor | None = None
-    """Last estimate of a leader that it faced, seen or received."""
+    """Last estimate of the leader that it faced, seen or received."""
     looking: bool = False
-    """Whether it looks for that one, while it follows others."""
+    """Whether it searches for this leader while it follows other neighbors."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
     lost: Loss | None = None
@@ -154,7 +154,7 @@ class Memory(NamedTuple):
     drag: Array = np.zeros(3)
     """Acceleration flown that does not show in the velocity, by drag or wind (3,), m/s^2."""
     params: PlannerParams | None = None
-    """Parameters with which the law was followed in the last step; None if it was not."""
+    """Parameters of the law in the last step; None if the law was not applied."""
     fading: tuple[Array, float] | None = None
     """The command (3,), m/s^2, from which the law's is faded in, and since when, s."""
     occlusion: Occlusion | None = None
@@ -164,7 +164,7 @@ class Memory(NamedTuple):
     disturbance: Any = None
     """See ``relative.Disturbance``."""
     switched: float = -math.inf
-    """When odometry was lost or returned last, s: the frame before is another one."""
+    """Time at which odometry was last lost or returned, s: the frame changed then."""
 
     def acceleration(self, n: Neighbor) -> list[float]:
         """Return a neighbor's acceleration, (3,), m/s^2; zero for a received one, as outdated."""
@@ -180,7 +180,7 @@ class Memory(NamedTuple):
             pending=self.pending, jumped=own.stamp, switched=now)
 
     def begun_afresh(self) -> Memory:
-        """Return the memory without anything of a flight that is over."""
+        """Return the memory without the data of the last flight."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
                       jumped=self.jumped, given_up=self.given_up)
 
@@ -188,9 +188,9 @@ class Memory(NamedTuple):
 def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable[Neighbor],
            params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
     """
-    Return the memory with the valid new inputs, without old ones, and the rejections.
+    Return the memory with the valid new inputs, without old inputs, and the rejections.
 
-    The order of the estimates has no influence: everything after this has the order of names.
+    The order of the estimates has no influence: all later steps use the order of names.
     """
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
@@ -279,7 +279,7 @@ def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams
 
 
 def update_pending(memory: Memory, command: Array, elapsed: float, params: PlannerParams) -> Array:
-    """Return the velocity (3,), m/s, that is commanded and not flown, with one more command."""
+    """Return the commanded, not yet flown velocity (3,), m/s, after one more command."""
     left = math.exp(-elapsed / params.response_time)
     return left * memory.pending + (1.0 - left) * params.response_time * command
 

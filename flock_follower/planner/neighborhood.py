@@ -55,7 +55,7 @@ class Neighborhood(NamedTuple):
     shares: Mapping[str, float]
     """From 0 for none to 1 for an edge: each changes over the time of a handover."""
     edges: frozenset[str]
-    """Names at the other ends of the own edges; others are only kept clear of."""
+    """Names of the neighbors with an edge; from the others the vehicle only keeps clear."""
     faced: Neighbor | None
     """The neighbor that it faces and keeps in sight."""
     level: Neighbor | None
@@ -79,7 +79,7 @@ def clearance(distance: float, n: Neighbor, params: PlannerParams) -> float:
 def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
                        params: PlannerParams, elapsed: float) -> Neighborhood:
     """
-    Return the relations of the neighbors at hand to the own vehicle.
+    Return the relations of the present neighbors to this vehicle.
 
     :param memory: with the relations of the step before, ``elapsed`` seconds ago.
     :param flock: all neighbors at hand, at one time; at least one of them can be followed.
@@ -112,7 +112,7 @@ def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
           params: PlannerParams) -> frozenset[str]:
     """
-    Return the names at the other ends of the own edges.
+    Return the names of the neighbors with an edge to this vehicle.
 
     :param held: those of the step before.
     """
@@ -143,7 +143,7 @@ KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
 
 
 def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> list[str]:
-    """Return warnings of neighbors that cannot be followed, or whose place is unknown."""
+    """Return warnings about neighbors that cannot be followed, or whose position is unknown."""
     v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
     for n in neighbors.flock:

@@ -53,7 +53,7 @@ SEEN_DEFAULT, RECEIVED_DEFAULT = Member(LEADER), Member(FOLLOWER)  # strangers
 
 def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     """
-    Return the role and size of a vehicle; a stranger's role depends on how it was detected.
+    Return the role and size of a vehicle; an unlisted one's role depends on its detection.
 
     A duplicate of a neighbor's marker is avoided, with the neighbor's radius.
     """
@@ -105,7 +105,7 @@ class GuardParams(Checked):
 
 
 class Edges(NamedTuple):
-    """The distances, m, from a neighbor to stay between, and the uncertainty of its position."""
+    """The least and largest distance, m, to a neighbor, and the uncertainty of its position."""
 
     near: float
     far: float = math.inf
@@ -116,9 +116,9 @@ class Edges(NamedTuple):
     spreading: float = 0.0
     """... and its growth rate, m/s."""
     headway: float = 0.0
-    """Time, s, for which there is room at the own speed towards it, and ..."""
+    """Headway, s: time for which there is space at the ego speed towards the neighbor, plus ..."""
     fastest: float = 0.0
-    """... at this speed of its own towards the vehicle, m/s."""
+    """... this speed of the neighbor towards the vehicle, m/s."""
 
     @classmethod
     def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
@@ -268,7 +268,7 @@ class PlannerParams(Checked):
 
     @property
     def climb_rate(self) -> float:
-        """Return the largest vertical speed, m/s, which leaves a part of v_max to level motion."""
+        """Return the largest vertical speed, m/s; it leaves a part of v_max for level motion."""
         return min(self.climb_rate_max, CLIMB_SHARE * self.v_max)
 
     def __post_init__(self) -> None:

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Control without odometry: the distance to the leader, and the relative velocity, by the marker.
+Control without odometry: controls distance and relative velocity to the leader by the marker.
 
 Own motion is then the autopilot's attitude and the accelerations flown, integrated; its velocity
-drifts. That drift is the same in the leader's estimate, so that distance and relative velocity do
-not have it. Only these two are used. The speed over the ground is neither known nor bounded.
+drifts. The leader's estimate has the same drift, so distance and relative velocity have none. Only
+these two are used. The speed over the ground is neither known nor bounded.
 
 The follower is led to the middle of the law's band by a relative velocity, which is bounded, and
 reached with the time constant VELOCITY_TIME. So all relative motion is damped; the common motion

@@ -60,7 +60,7 @@ class Decision(NamedTuple):
 
     state: State
     reason: str = ''
-    """The reason for the state, unless it is TRACK of a neighbor in sight."""
+    """The reason for the state; '' for TRACK of a neighbor in sight."""
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
@@ -72,14 +72,14 @@ class Decision(NamedTuple):
     retreat: Array | None = None
     """Velocity (3,), m/s, to brake to if odometry is lost; None: brake to a hover."""
     stamp: float | None = None
-    """Stamp of the newest estimate on which the command rests, s; None without one."""
+    """Stamp of the newest estimate that the command is based on, s; None without one."""
     limits: str = ''
     """The active limits: of 'a_max', 'v_max' and the reasons of the guard's bounds."""
     rejected: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
-    """Neighbors that it cannot follow, and its reaction to lost ones."""
+    """Warnings: neighbors that cannot be followed, and the reaction to lost neighbors."""
     altitude: float = math.nan
-    """The altitude that the acceleration leads to, m; NaN if it leads to none."""
+    """The commanded altitude, m; NaN without one."""
     edges: tuple[str, ...] = ()
     """The neighbors at the ends of its edges; others are only kept clear of."""
 
@@ -102,14 +102,14 @@ class Scene(NamedTuple):
     leader: Neighbor | None
     """Last estimate of a lost leader to search for while others are followed."""
     missed: Neighbor | None
-    """The lost neighbor: ``leader``, or the newest one of those lost if none is followed."""
+    """The lost neighbor: ``leader``, or if none is followed the neighbor that was lost last."""
     predictions: Mapping[str, Prediction]
     """Predictions of the neighbors to keep clear of, by name."""
 
 
 def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: PlannerParams,
            elapsed: float) -> tuple[Memory, Scene]:
-    """Return the memory with all to keep clear of, and the scene ``elapsed`` s after the last."""
+    """Return the memory with all neighbors to keep clear of, and the scene after ``elapsed`` s."""
     neighbors, leader = NOBODY, None
     if state is State.TRACK:
         here = [propagate(n, me.stamp) for n in memory.neighbors.values()]
@@ -142,7 +142,7 @@ def _predict(n: Neighbor, memory: Memory, me: OwnState,
 def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
            params: PlannerParams) -> Mapping[str, Neighbor]:
     """
-    Return the neighbors to keep clear of: those at hand, and lost ones that may be near.
+    Return the neighbors to keep clear of: present ones, and lost ones that may be near.
 
     :param leader: the leader to look for.
     """

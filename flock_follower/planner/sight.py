@@ -93,7 +93,7 @@ class FieldOfView(NamedTuple):
         return cls(max(aside), -min(aside), max(up), -min(up), heading)
 
     def angle_outside(self, bearing: float, edge: float = 0.0) -> float:
-        """Return by how much a bearing is outside the image, shrunk by ``edge``, rad; 0 inside."""
+        """Return the angle, rad, from the image, shrunk by ``edge``, to a bearing; 0 inside."""
         off = wrap_angle(bearing - self.heading)
         return max(off - self.left + edge, edge - self.right - off, 0.0)
 
@@ -104,7 +104,7 @@ FieldsOfView = tuple[FieldOfView, ...]
 
 def visible(view: FieldsOfView, offset: Array, yaw: float, forward: float, margin: float) -> bool:
     """
-    Return whether a neighbor is in an image, by at least a margin, m, at its place.
+    Return whether a neighbor is in an image, at least a margin, m, inside its edge.
 
     :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
     :param forward: own acceleration ahead, m/s^2, which tilts the camera.

@@ -56,7 +56,7 @@ class Altitude(NamedTuple):
     held: float
     """m."""
     lowest: float
-    """m; the vehicle is below it only if the flight began there."""
+    """m; the vehicle is lower only if the flight began lower."""
     highest: float
     """m."""
     climb: float = 0.0
@@ -162,7 +162,7 @@ def _within_limits(ground: float, params: PlannerParams) -> tuple[float, float]:
 
 def _stopped_within(gap: float, gain: float) -> float:
     """
-    Return the speed, m/s, that can be stopped within a gap, m; negative: the return speed.
+    Return the speed, m/s, from which it stops within a gap, m; negative: the return speed.
 
     :param gain: speed for each meter, 1/s, while the deceleration is at most BRAKING; farther away
         the deceleration is BRAKING.
@@ -183,7 +183,7 @@ LOOK_THERE = 0.5  # s for which the vehicle faces that place first
 
 def face_yaw(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
              elapsed: float) -> float:
-    """Return the yaw that turns from the last one to the place where a neighbor will soon be."""
+    """Return the yaw after a turn from the last yaw towards a neighbor's predicted place."""
     x, y, _ = (neighbor.position - me.position).tolist()
     distance = math.hypot(x, y)
     if distance < OVERHEAD_DISTANCE:

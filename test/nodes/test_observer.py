@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+import subprocess
+import sys
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +31,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from flock_follower.checks.collector import POSES
-from flock_follower.nodes.observer import DISCOVERY, Observer
+from flock_follower.nodes.observer import DISCOVERY, Observer, processes, SIMULATOR
+from flock_follower.topic_names import OURS
 
 
 def test_no_arrival_is_counted_before_the_clock_is_known(ros: None, monkeypatch: Any) -> None:
@@ -75,3 +78,13 @@ def test_foreign_poses_are_taken_once_parameters_are_read(
     assert observer.seen.topics['/poses'].stamps == [100.0]
     assert observer.seen.sources['leader'].taken == 1
     observer.destroy_node()
+
+
+def test_the_simulator_is_no_other_program() -> None:
+    with subprocess.Popen([sys.executable, '-', 'flock_desk.simulator_node'],
+                          stdin=subprocess.PIPE) as simulator:
+        ours, with_simulator = ({process for process, *_ in processes(names)}
+                                for names in (OURS, (*OURS, *SIMULATOR)))
+        assert simulator.stdin is not None
+        simulator.stdin.close()
+    assert simulator.pid in with_simulator - ours

@@ -34,7 +34,7 @@ BEFORE_STEP = 'stamped before the system clock was set'
 
 class ClockWatch:
     """
-    Finds steps of the system clock, and messages that were stamped before the last one.
+    Detects steps of the system clock, and messages that were stamped before the last step.
 
     ``shift`` is the sum of all steps of the clock, ns: a stamp minus the shift is the time of a
     clock without steps.

@@ -169,7 +169,7 @@ class Diagnostics:
         return self.latencies.setdefault(name, deque(maxlen=LATENCIES))
 
     def reject(self, reason: str, detail: str = '') -> None:
-        """Count something dropped under a short reason; log it at most once per 5 s."""
+        """Count a dropped input under a short reason; log it at most once per 5 s."""
         self.counters[reason] += 1
         self.log(WARN, f'{reason}: {detail}' if detail else reason, key=reason)
 

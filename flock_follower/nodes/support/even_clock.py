@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The time of a node that goes on evenly while the system clock is set."""
+"""A node's time that does not jump if the system clock is set."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flock_follower.nodes.support.runtime import FlockNode
 
 class EvenClock(ClockWatch):
     """
-    The time of a node, which goes on evenly if the system clock is set.
+    The time of a node, which does not jump if the system clock is set.
 
     ``shift`` is the sum of all steps of the system clock, ns. With ``use_sim_time`` the time is
     that of /clock, and every stamp is used.

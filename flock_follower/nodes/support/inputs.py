@@ -41,7 +41,7 @@ LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def best_effort(depth: int = 1) -> QoSProfile:
-    """Return the QoS that takes what reliable and best-effort publishers send alike."""
+    """Return the QoS that receives from reliable and from best-effort publishers."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -62,7 +62,7 @@ def for_each(messages: Iterable[Any], take: Callable[[Any], None]) -> None:
 
 
 class NodeClock(Protocol):
-    """A clock of a node that goes on evenly if the system clock is set: ``EvenClock``."""
+    """A clock of a node that does not jump if the system clock is set: ``EvenClock``."""
 
     shift: int
 

@@ -33,7 +33,7 @@ UDP_PROFILE = 'config/dds/fastdds_udp.xml'
 
 def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     """
-    Have Fast DDS use UDP alone; call it before ``rclpy.init`` with ``os.environ``.
+    Restrict Fast DDS to UDP; call this before ``rclpy.init`` with ``os.environ``.
 
     When it first sends to another process, Fast DDS 2.14 tests the shared-memory port of that
     process, sometimes for 333 ms, for 1 s if it was killed. A publisher waits meanwhile and holds
@@ -66,7 +66,7 @@ def shared_memory_size() -> int:
 
 
 def _is_own(profile: str) -> bool:
-    """Return whether a file is, or is a copy of, the profile that this package offers."""
+    """Return whether a file is this package's profile, or a copy of it."""
     try:
         return Path(profile).read_bytes() == resource(_OWN_PROFILE).read_bytes()
     except OSError:

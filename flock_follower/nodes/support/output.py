@@ -25,8 +25,8 @@ def never_block_output() -> None:
     """
     Make writes to stdout and stderr fail instead of waiting for a reader.
 
-    A terminal stopped by Ctrl-S, a hung ssh or a full pipe would otherwise stop the process at its
-    next log line. Lines are lost then. Files are left as they are.
+    Otherwise a terminal stopped by Ctrl-S, a hung ssh or a full pipe would stop the process at its
+    next log line. If a write fails, the line is lost. Output to files is not changed.
     """
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):

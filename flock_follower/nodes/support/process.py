@@ -122,7 +122,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
 
 def _start_ros(arguments: Sequence[str]) -> None:
     """
-    Start ROS, and have the signals that end this process shut it down.
+    Start ROS, and install the signal handlers that shut ROS down.
 
     :raises RuntimeError: malformed ``--ros-args``.
     """
@@ -145,7 +145,8 @@ def _load_type_support() -> None:
     Load the type support of messages without the generator of their Python code.
 
     The generator comes with a parser of grammars: 7 MB and 0.1 s for each node. The type support
-    does without it if its import fails, as that of a module that is None does.
+    works without the generator if its import fails; setting the module to None lets the import
+    fail.
     """
     if _GENERATOR in sys.modules:
         return

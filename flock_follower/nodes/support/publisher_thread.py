@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Publishes and logs for the setpoint thread, which must not wait for either."""
+"""Publishes and logs for the setpoint thread, which must not wait for a publisher or a log."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXIT_TIMEOUT: Final[float] = 0.05
 
 class PublisherThread:
     """
-    Runs the actions that one other thread submits, in order, in a thread of its own.
+    Runs the actions that another thread submits, in order, in a separate thread.
 
     A publisher or a log line may wait for a socket, a disk or a lock of rclpy. ``submit`` waits
     for none of them: it takes no lock and makes no system call. (An executor would have to be
@@ -54,7 +54,7 @@ class PublisherThread:
         self._thread.start()
 
     def submit(self, action: Callable[[], None]) -> None:
-        """Have the thread run an action; call it from one other thread only. Never waits."""
+        """Queue an action for the thread, without waiting; call it from one other thread only."""
         if self._waiting.qsize() >= MOST_WAITING:
             with contextlib.suppress(queue.Empty):
                 self._waiting.get_nowait()

@@ -47,7 +47,7 @@ class RemoteParameters:
         self._get = node.create_client(GetParameters, f'{other}/get_parameters')
 
     def ask(self) -> bool:
-        """Request all; return False if the node was not found: it may have just started."""
+        """Request all parameters; return False if the node was not found (yet)."""
         if not (self._list.service_is_ready() and self._get.service_is_ready()):
             return False
         self._list.call_async(ListParameters.Request()).add_done_callback(self._take_names)
@@ -87,7 +87,7 @@ class WatchedParameters(RemoteParameters):
         node.create_timer(WATCH_PERIOD, self.ask, clock=STEADY)
 
     def take(self, values: dict[str, Any]) -> None:
-        """Take all values of the other node, and what differs from those before in flight."""
+        """Take all values of the other node, and record changes in flight."""
         if self.values is not None and self.values != values and self._flying():
             self._difference = differences(self.values, values)
         super().take(values)

@@ -59,7 +59,7 @@ LONGEST_WAIT = 1_000_000_000  # ns: every node polls more often
 
 class Waiting(CallbackGroup):
     """
-    Holds subscriptions that an executor serves only while ``awaited`` returns True.
+    A group of subscriptions that the executor serves only while ``awaited`` returns True.
 
     Otherwise their messages wait until a node takes them. The result of ``awaited`` may change in
     the executor's thread only: the executor asks each time before it waits.
