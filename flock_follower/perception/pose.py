@@ -123,7 +123,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         if sharp:
             return None
     if found is None:  # it is smeared, or it moved farther than expected
-        found, whole = _fit_around(image, camera, sought, expected.pose, smeared)
+        found, whole = _fit_around(image, camera, sought, expected.pose, last if smeared else None)
     if found is not None and found.inliers < PLAIN_INLIERS:  # the others may be out of reach
         again = fit(image, camera, found.lines.model, found.pose)
         found = again if again is not None and again.inliers > found.inliers else found
@@ -147,13 +147,20 @@ class _Whole(NamedTuple):
 
 
 def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
-                smeared: bool) -> tuple[EdgeFit | None, _Whole | None]:
-    """Return fits to the edges and to a whole print up to two cells and a half from a pose."""
-    starts = _smear_starts(image, camera, sought, pose, smeared)
-    if not starts and not smeared:
+                last: Measurement | None) -> tuple[EdgeFit | None, _Whole | None]:
+    """
+    Return fits to the edges and to a whole print up to two cells and a half from a pose.
+
+    :param last: the last measurement, if the print was smeared in it.
+    """
+    smeared = last is not None
+    whole = None if last is None else _fit_as_before(image, camera, sought, pose, last)
+    if whole is not None and whole.fit.blur > EDGELESS:
+        return None, whole
+    starts = [] if whole is not None else _smear_starts(image, camera, sought, pose, smeared)
+    if whole is None and not starts and not smeared:
         return None, None
-    whole = None
-    if smeared:
+    if smeared and whole is None:
         whole = _fit_whole(image, camera, sought, starts)
         if whole is not None and whole.fit.blur > EDGELESS:
             return None, whole
@@ -273,6 +280,15 @@ def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: T
     return [(k, start) for k, start in found if start is not None]
 
 
+def _fit_as_before(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
+                   last: Measurement) -> _Whole | None:
+    """Return the fit to a single marker whose print is smeared as in the last image, or None."""
+    if last.smear is None or not facing(sought.model, pose).all():
+        return None
+    found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True)
+    return None if found is None else _Whole(0, found)
+
+
 def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
                starts: list[tuple[int, SmearStart]]) -> _Whole | None:
     """Return the fit to the first marker whose print is smeared as it starts, or None."""
@@ -289,7 +305,7 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Wh
     index, fitted = found
     start = _mirrored_body(sought, index, fitted.pose)
     other = None if start is None else descend(
-        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens))
+        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True)
     return _choose_smeared(
         sought, index, [fitted] if other is None else [fitted, other], expected)
 
@@ -330,7 +346,8 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
     return Measurement(
         sought.neighbor.name, found.pose,
         sought.neighbor.markers[index].T_body_marker.translation,
-        found.covariance * DEVIATION_FACTOR**2, found.rms, None, alike=ALIKE_SHARE)
+        found.covariance * DEVIATION_FACTOR**2, found.rms, None, alike=ALIKE_SHARE,
+        smear=found.smear, lens=found.lens)
 
 
 def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
