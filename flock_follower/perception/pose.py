@@ -84,6 +84,10 @@ PLAIN_INLIERS = 0.9
 RUN_TOGETHER = 0.25
 #: If a print that is followed smeared is blurred by more than this, cells, it has no edges to fit.
 EDGELESS = 0.3
+#: An attitude that differs by more, rad, is another one.
+MAX_TURN = 0.3
+#: An attitude whose chi^2 is less by this than that of the mirrored one is sure, for a first look.
+SURE_MARGIN = 4.0
 #: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
 #: residuals are errors of the model, which are alike for neighboring samples.
 EFFECTIVE_SMEAR_SAMPLES = 40.0
@@ -216,6 +220,27 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
         if joint is not None and len(joint.lines.model.codes) > 1:
             found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), math.inf)
     return _measurement(sought, found, best)
+
+
+def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
+                pose: Transform, up: Array | None) -> bool:
+    """
+    Return whether a detected marker may show another attitude than a pose, ``T_camera_body``.
+
+    It costs half of :func:`locate`, which then says which one: one attitude is fitted, and the
+    mirrored one to the edges found so.
+    """
+    marker = sought.neighbor.markers[index]
+    T_marker_body = marker.T_body_marker.inverse()
+    alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
+    for start in ippe(corners, camera, marker.side_length):
+        found = fit(image, camera, alone, start @ T_marker_body)
+        if found is not None and found.inliers > FOUND_INLIERS:
+            chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found))
+            best = choose([chosen, *_mirrored_hypotheses(camera, found)], PosePrior(None, up))
+            return angle(best.chosen.pose, pose) > MAX_TURN or (
+                best.other is not None and best.margin < SURE_MARGIN)
+    return False
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
