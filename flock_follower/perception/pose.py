@@ -54,6 +54,7 @@ from flock_follower.perception.print_model import edge_model, EdgeModel, shows_c
 from flock_follower.perception.smear_fit import (
     descend,
     fit_smeared,
+    MOST_STEPS,
     seek,
     SmearFit,
     SmearStart,
@@ -86,8 +87,11 @@ RUN_TOGETHER = 0.25
 EDGELESS = 0.3
 #: An attitude that differs by more, rad, is another one.
 MAX_TURN = 0.3
-#: An attitude whose chi^2 is less by this than that of the mirrored one is sure, for a first look.
-SURE_MARGIN = 4.0
+#: Most steps of the fits to a smeared print in one image, of both attitudes together. If the steps
+#: do not suffice for the mirrored one, it is fitted in a later image.
+MAX_STEPS = 9
+#: Most steps of a fit from the smear of the last image, before smear and place are searched for.
+AS_BEFORE_STEPS = 6
 #: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
 #: residuals are errors of the model, which are alike for neighboring samples.
 EFFECTIVE_SMEAR_SAMPLES = 40.0
@@ -137,7 +141,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         whole = _fit_whole(image, camera, sought, _smear_starts(
             image, camera, sought, expected.pose, True))
     if whole is not None and (found is None or blurred):
-        return _of_smears(image, camera, sought, whole, expected) if check_mirrored else (
+        return _of_smears(image, camera, sought, whole, expected, last) if check_mirrored else (
             _with_doubt(sought, whole, last))
     return None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
@@ -238,19 +242,18 @@ def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: in
         if found is not None and found.inliers > FOUND_INLIERS:
             chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found))
             best = choose([chosen, *_mirrored_hypotheses(camera, found)], PosePrior(None, up))
-            return angle(best.chosen.pose, pose) > MAX_TURN or (
-                best.other is not None and best.margin < SURE_MARGIN)
+            return angle(best.chosen.pose, pose) > MAX_TURN
     return False
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
                    starts: list[Transform], expected: PosePrior) -> Measurement | None:
     """Return a neighbor by the whole print of a detected marker, smeared."""
-    fits = [found for start in starts
-            if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    if len(fits) == 1:
-        return _of_smears(image, camera, sought, _Whole(index, fits[0]), expected)
-    return _choose_smeared(sought, index, fits, expected) if fits else None
+    for start in starts:
+        found = fit_smeared(image, camera, sought.smears[index], start)
+        if found is not None:
+            return _of_smears(image, camera, sought, _Whole(index, found), expected, None)
+    return None
 
 
 class _Shown(NamedTuple):
@@ -310,7 +313,8 @@ def _fit_as_before(image: GrayImage, camera: CameraModel, sought: Target, pose: 
     """Return the fit to a single marker whose print is smeared as in the last image, or None."""
     if last.smear is None or not facing(sought.model, pose).all():
         return None
-    found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True)
+    found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True,
+                    AS_BEFORE_STEPS)
     return None if found is None else _Whole(0, found)
 
 
@@ -325,12 +329,22 @@ def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
 
 
 def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Whole,
-               expected: PosePrior) -> Measurement:
-    """Return the measurement of the likelier attitude: of a fit, or of its mirrored one."""
+               expected: PosePrior, last: Measurement | None) -> Measurement:
+    """
+    Return the measurement of the likelier attitude: of a fit, or of its mirrored one.
+
+    :param last: the last measurement, if any: if its print was smeared, the mirrored attitude can
+        wait for an image with steps left.
+    """
     index, fitted = found
     start = _mirrored_body(sought, index, fitted.pose)
-    other = None if start is None else descend(
-        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True)
+    can_wait = last is not None and last.smear is not None
+    steps = MAX_STEPS - fitted.steps if can_wait else MOST_STEPS
+    other = None if start is None or steps < 1 else descend(
+        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True,
+        steps)
+    if start is not None and other is None and can_wait:
+        return _with_doubt(sought, found, last)
     return _choose_smeared(
         sought, index, [fitted] if other is None else [fitted, other], expected)
 

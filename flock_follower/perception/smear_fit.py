@@ -69,7 +69,7 @@ _MIN_FIT_LIKENESS = 0.95
 #: Least difference of white and black, gray levels.
 _MIN_CONTRAST = 10.0
 #: Most steps of a descent.
-_MAX_PASSES = 10
+MOST_STEPS = 10
 #: First steps, in which that of the smear is halved: from a smear that is only roughly known.
 _DAMPED_PASSES = 2
 #: First steps of a descent from the smear of another fit, whose weights are not yet those of it.
@@ -281,7 +281,7 @@ class _Descent(NamedTuple):
 
 
 def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
-            known: bool = False) -> SmearFit | None:
+            known: bool = False, most_steps: int = MOST_STEPS) -> SmearFit | None:
     """
     Return the fit at the least weighted squares near a pose and a smear.
 
@@ -291,7 +291,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
     weights, variance, response = np.ones(model.places.shape[1]), _MIN_VARIANCE, None
     first = _KNOWN_PASSES if known else _DAMPED_PASSES
     before: _Linear | None = None
-    for count in range(_MAX_PASSES):
+    for count in range(most_steps):
         fresh = before is None
         if before is None:
             lens, linearized_at = _lens_of(camera, model, pose, lens), smear
