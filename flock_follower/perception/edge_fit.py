@@ -241,9 +241,9 @@ MAX_TURN_STEP = 1.0
 _FINAL_STEP_FACTOR = 2.0
 #: Least share of the edges of either axis, by weight, that a pose rests on.
 _MIN_AXIS_SHARE = 0.1
-#: Edges are found again while a smaller share of them, by weight, agrees, and their share grows by
-#: more than _LEAST_GAIN.
+#: Edges are found again while a smaller share of them, by weight, agrees.
 _REFIND_BELOW = 0.75
+#: Least growth of this share by a step: with less, the other edges are hidden.
 _LEAST_GAIN = 0.02
 #: Edges are found again if the kernel is wider or narrower than the blur by this factor.
 _MAX_MISMATCH = 1.6
@@ -317,7 +317,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         suited = _match_spacing(lines, blur)
         alike = all(1.0 / _MAX_MISMATCH < a / b < _MAX_MISMATCH for a, b in zip(suited, spacing))
         before, share = share, float(step.weights.sum()) / len(model)
-        clear = share > _REFIND_BELOW or count > 0 and share < before + _LEAST_GAIN
+        clear = share > _REFIND_BELOW or (count > 0 and share < before + _LEAST_GAIN)
         farthest, turned = float(np.abs(step.explained).max()), turn > _REPROJECT_TURN
         near = _REFIND_BEYOND * min(lines.narrowest)
         settled = farthest * farthest < near and alike and clear and not turned

@@ -74,7 +74,7 @@ MOST_STEPS = 10
 _DAMPED_PASSES = 2
 #: First steps of a descent from the smear of another fit, whose weights are not yet those of it.
 _KNOWN_PASSES = 1
-#: From the third step on, the most of the image's variance that the print may leave unexplained. Of
+#: With the third step, the most of the image's variance that the print may leave unexplained. Of
 #: descents that end in a fit 99 % have less than 0.04 there, of others 90 % more than 0.26.
 _MAX_UNEXPLAINED = 0.2
 #: After a step that turns by less, rad, the slopes of the print serve for the next one, too.
@@ -297,7 +297,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
             lens, linearized_at = _lens_of(camera, model, pose, lens), smear
             at = _linearize(image, camera, model, SmearStart(pose, smear, lens), response)
         else:
-            at = _looked_again(image, camera, model, SmearStart(pose, smear, lens), before)
+            at = _look_again(image, camera, model, SmearStart(pose, smear, lens), before)
         if at is None:
             return None
         # The steeper it is, the more the true blur of lens and cells matters.
@@ -325,7 +325,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
         if count >= first and factor * turn < _LAST_TURN and factor * shift < _LAST_SHIFT:
             break
         squares = residual * residual
-        if count == _DAMPED_PASSES and _unexplained(at, squares) > _MAX_UNEXPLAINED:
+        if count == _DAMPED_PASSES and _unexplained_share(at, squares) > _MAX_UNEXPLAINED:
             return None
         variance = max(1.4826**2 * median(squares), _MIN_VARIANCE)
         weights = np.maximum(1.0 - squares / (25.0 * (variance + at.steep)), 0.0)**2
@@ -340,7 +340,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
         residual, step[6:12].dot(rows), weights, information, response[0], rows, count + 1))
 
 
-def _looked_again(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
+def _look_again(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
                   before: _Linear) -> _Linear | None:
     """Return what the image shows after a short step, with the slopes of the print before."""
     seen = _look(image, camera, _basis(start.pose, model), model.places)
@@ -349,7 +349,7 @@ def _looked_again(image: GrayImage, camera: CameraModel, model: SmearModel, star
         center=start.pose.apply(model.middle[None])[0])
 
 
-def _unexplained(at: _Linear, squares: Array) -> float:
+def _unexplained_share(at: _Linear, squares: Array) -> float:
     """Return the share of the image's variance that is left, given the squared residuals."""
     brightness = at.brightness[at.usable]
     brightness -= brightness.mean()
