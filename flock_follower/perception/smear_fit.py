@@ -79,10 +79,13 @@ _KNOWN_PASSES = 1
 _MAX_UNEXPLAINED = 0.2
 #: After a step that turns by less, rad, the slopes of the print serve for the next one, too.
 _SAME_SLOPES_TURN = 0.06
-#: The same for a step of pose and smear, cells.
+#: The same for a step of the pose, cells.
 _SAME_SLOPES_SHIFT = 0.2
-#: With the slopes of the step before, the last one is this many times shorter.
-_SAME_SLOPES_FACTOR = 2.0
+#: The same for a step of the smear, cells: the print is not rendered again with the smear found.
+_SAME_SLOPES_SMEAR = 0.05
+#: With the slopes of the step before, and from the smear of another fit, whose first step is not
+#: halved, the last step must be this many times shorter.
+_CLOSER = 2.0
 #: A step that turns by less, rad, may be the last.
 _LAST_TURN = 0.02
 #: A step of pose and smear that is shorter, cells, may be the last.
@@ -321,7 +324,8 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
             return None
         pose = moved(pose, at.center, step)
         residual = at.brightness - step.dot(at.design)
-        shift, factor = max(offset / model.cell, smeared), 1.0 if fresh else _SAME_SLOPES_FACTOR
+        shift = max(offset / model.cell, smeared)
+        factor = 1.0 if fresh and not known else _CLOSER
         if count >= first and factor * turn < _LAST_TURN and factor * shift < _LAST_SHIFT:
             break
         squares = residual * residual
@@ -329,8 +333,9 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
             return None
         variance = max(1.4826**2 * median(squares), _MIN_VARIANCE)
         weights = np.maximum(1.0 - squares / (25.0 * (variance + at.steep)), 0.0)**2
-        again = fresh and count + 1 >= first
-        before = at if again and turn < _SAME_SLOPES_TURN and shift < _SAME_SLOPES_SHIFT else None
+        near = (turn < _SAME_SLOPES_TURN and shift < _SAME_SLOPES_SHIFT
+                and smeared < _SAME_SLOPES_SMEAR)
+        before = at if fresh and near and count + 1 >= first else None
     else:
         return None
     if math.hypot(*step[10:12].tolist()) > _MAX_FALL_OFF * response[0]:
