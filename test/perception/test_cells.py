@@ -178,7 +178,7 @@ def test_no_other_marker_shows_code_in_even_light_or_shade(
 
 
 @pytest.mark.parametrize(('level', 'share'), [(255, 0.4), (200, 0.4), (115, 0.4), (30, 0.4)])
-def test_no_other_marker_shows_code_though_two_fifths_of_it_are_hidden(
+def test_no_other_marker_that_is_half_hidden_shows_code(
         level: int, share: float) -> None:
     rng, dictionary = np.random.default_rng(2), DICTIONARY
     radius = PX * math.sqrt(share * 16 / math.pi)

@@ -92,7 +92,7 @@ def test_a_fit_ends_where_it_leads_no_farther(cells: float) -> None:
     assert np.linalg.norm(found.smear) == pytest.approx(cells, abs=0.15)
 
 
-def test_descent_from_the_smear_of_the_last_image_ends_where_that_from_a_search_does() -> None:
+def test_descent_from_last_smear_ends_where_a_searched_one_does() -> None:
     for k, cells in enumerate((0.6, 1.0, 1.5, 1.8)):
         before = known(fit_smeared(smeared(HERE, cells, 0.4, gamma=2.2), CAMERA, MODEL,
                                    off(body(HERE), k)))
@@ -110,7 +110,7 @@ def test_descent_from_the_smear_of_the_last_image_ends_where_that_from_a_search_
 
 @pytest.mark.parametrize('cells', [1.0, 1.35])
 @pytest.mark.parametrize('marker_id', [0, 3, 17, 33])
-def test_no_mirrored_print_is_taken_for_it_up_to_a_smear_of_a_cell_and_a_third(
+def test_smeared_mirrored_prints_are_refused(
         marker_id: int, cells: float) -> None:
     model = smear_model(Marker(marker_id, SIDE, MOUNTED), DICTIONARY)
     own = marker_code(marker_id)
