@@ -243,6 +243,8 @@ _FINAL_STEP_FACTOR = 2.0
 _MIN_AXIS_SHARE = 0.1
 #: Edges are found again while a smaller share of them, by weight, agrees.
 _REFIND_BELOW = 0.75
+#: Least growth of this share by a step: with less, the other edges are hidden.
+_LEAST_GAIN = 0.02
 #: Edges are found again if the kernel is wider or narrower than the blur by this factor.
 _MAX_MISMATCH = 1.6
 #: Variances of an edge's place of either axis before any is known, px^2.
@@ -294,7 +296,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
     :param spacing: of the profiles, px, that suited the image before; then ``start`` may be off
         by four times as much.
     """
-    pose, last = start, None
+    pose, last, share = start, None, 0.0
     bloom: Array = _NO_BLOOM
     lines = project(camera, model, start)
     if lines is not None and spacing is None:
@@ -314,7 +316,8 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
                 for width, each in zip(widths, spacing)]
         suited = _match_spacing(lines, blur)
         alike = all(1.0 / _MAX_MISMATCH < a / b < _MAX_MISMATCH for a, b in zip(suited, spacing))
-        clear = float(step.weights.sum()) > _REFIND_BELOW * len(model)
+        before, share = share, float(step.weights.sum()) / len(model)
+        clear = share > _REFIND_BELOW or (count > 0 and share < before + _LEAST_GAIN)
         farthest, turned = float(np.abs(step.explained).max()), turn > _REPROJECT_TURN
         near = _REFIND_BEYOND * min(lines.narrowest)
         settled = farthest * farthest < near and alike and clear and not turned

@@ -42,7 +42,7 @@ from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
-from flock_follower.perception.pose import locate, Target
+from flock_follower.perception.pose import contradicts, locate, MAX_TURN, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.square_pose import refine
 from flock_follower.perception.time_offset import MountedCamera
@@ -52,7 +52,6 @@ from flock_follower.perception.time_offset import MountedCamera
 CONFIRM_PERIOD = 0.2
 #: Error of a measured direction that covariances of edges lack, px: blur, JPEG, and calibration.
 DIRECTION_ERROR = 0.06
-MAX_TURN = 0.3  # rad: a fit whose attitude differs by more from the detection's is replaced
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
@@ -276,6 +275,9 @@ class Look:
             for index, marker in enumerate(sought.neighbor.markers):
                 middle = place.apply(marker.T_body_marker.translation)
                 for outline in corners[ids == marker.marker_id]:
+                    if not contradicts(
+                            image, self.model, sought, index, outline, place, prior.up):
+                        continue
                     again = locate(image, self.model, sought, index, outline, prior, False)
                     if again is not None and angle(again.T_camera_body, place) > MAX_TURN and (
                             math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),

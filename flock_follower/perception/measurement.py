@@ -115,7 +115,8 @@ class Measurement(NamedTuple):
     ``margin`` is by how much chi^2 favors this attitude over the mirrored one; 0 if both are
     equal, infinite if several markers decide it, None if it was not checked. ``doubt`` is the
     probability of the mirrored attitude when it was last checked. ``alike`` is the share of the
-    covariance that is of errors alike from image to image.
+    covariance that is of errors alike from image to image. ``smear`` and ``lens`` are those of
+    a smeared print, as in ``SmearFit``.
     """
 
     name: str
@@ -128,6 +129,8 @@ class Measurement(NamedTuple):
     margin: float | None = None
     doubt: float = 0.0
     alike: float = 0.0
+    smear: Array | None = None
+    lens: int = 0
 
 
 def widened(measurement: Measurement, best: Choice) -> Measurement:

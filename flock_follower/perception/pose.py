@@ -54,6 +54,7 @@ from flock_follower.perception.print_model import edge_model, EdgeModel, shows_c
 from flock_follower.perception.smear_fit import (
     descend,
     fit_smeared,
+    MOST_STEPS,
     seek,
     SmearFit,
     SmearStart,
@@ -84,6 +85,13 @@ PLAIN_INLIERS = 0.9
 RUN_TOGETHER = 0.25
 #: If a print that is followed smeared is blurred by more than this, cells, it has no edges to fit.
 EDGELESS = 0.3
+#: An attitude that differs by more, rad, is another one.
+MAX_TURN = 0.3
+#: Most steps of the fits to a smeared print in one image, of both attitudes together. If the steps
+#: do not suffice for the mirrored one, it is fitted in a later image.
+MAX_STEPS = 9
+#: Most steps of a fit from the smear of the last image, before smear and place are searched for.
+AS_BEFORE_STEPS = 6
 #: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
 #: residuals are errors of the model, which are alike for neighboring samples.
 EFFECTIVE_SMEAR_SAMPLES = 40.0
@@ -123,7 +131,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         if sharp:
             return None
     if found is None:  # it is smeared, or it moved farther than expected
-        found, whole = _fit_around(image, camera, sought, expected.pose, smeared)
+        found, whole = _fit_around(image, camera, sought, expected.pose, last if smeared else None)
     if found is not None and found.inliers < PLAIN_INLIERS:  # the others may be out of reach
         again = fit(image, camera, found.lines.model, found.pose)
         found = again if again is not None and again.inliers > found.inliers else found
@@ -133,7 +141,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         whole = _fit_whole(image, camera, sought, _smear_starts(
             image, camera, sought, expected.pose, True))
     if whole is not None and (found is None or blurred):
-        return _of_smears(image, camera, sought, whole, expected) if check_mirrored else (
+        return _of_smears(image, camera, sought, whole, expected, last) if check_mirrored else (
             _with_doubt(sought, whole, last))
     return None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
@@ -147,13 +155,20 @@ class _Whole(NamedTuple):
 
 
 def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
-                smeared: bool) -> tuple[EdgeFit | None, _Whole | None]:
-    """Return fits to the edges and to a whole print up to two cells and a half from a pose."""
-    starts = _smear_starts(image, camera, sought, pose, smeared)
-    if not starts and not smeared:
+                last: Measurement | None) -> tuple[EdgeFit | None, _Whole | None]:
+    """
+    Return fits to the edges and to a whole print up to two cells and a half from a pose.
+
+    :param last: the last measurement, if the print was smeared in it.
+    """
+    smeared = last is not None
+    whole = None if last is None else _fit_as_before(image, camera, sought, pose, last)
+    if whole is not None and whole.fit.blur > EDGELESS:
+        return None, whole
+    starts = [] if whole is not None else _smear_starts(image, camera, sought, pose, smeared)
+    if whole is None and not starts and not smeared:
         return None, None
-    whole = None
-    if smeared:
+    if smeared and whole is None:
         whole = _fit_whole(image, camera, sought, starts)
         if whole is not None and whole.fit.blur > EDGELESS:
             return None, whole
@@ -211,14 +226,34 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     return _measurement(sought, found, best)
 
 
+def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
+                pose: Transform, up: Array | None) -> bool:
+    """
+    Return whether a detected marker may show another attitude than a pose, ``T_camera_body``.
+
+    It costs half of :func:`locate`, which then says which one: one attitude is fitted, and the
+    mirrored one to the edges found so.
+    """
+    marker = sought.neighbor.markers[index]
+    T_marker_body = marker.T_body_marker.inverse()
+    alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
+    for start in ippe(corners, camera, marker.side_length):
+        found = fit(image, camera, alone, start @ T_marker_body)
+        if found is not None and found.inliers > FOUND_INLIERS:
+            chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found))
+            best = choose([chosen, *_mirrored_hypotheses(camera, found)], PosePrior(None, up))
+            return angle(best.chosen.pose, pose) > MAX_TURN
+    return False
+
+
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
                    starts: list[Transform], expected: PosePrior) -> Measurement | None:
-    """Return a neighbor by a fit of the whole smeared print of a detected marker."""
-    fits = [found for start in starts
-            if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    if len(fits) == 1:
-        return _of_smears(image, camera, sought, _Whole(index, fits[0]), expected)
-    return _choose_smeared(sought, index, fits, expected) if fits else None
+    """Return a neighbor by the whole print of a detected marker, smeared."""
+    for start in starts:
+        found = fit_smeared(image, camera, sought.smears[index], start)
+        if found is not None:
+            return _of_smears(image, camera, sought, _Whole(index, found), expected, None)
+    return None
 
 
 class _Shown(NamedTuple):
@@ -273,6 +308,16 @@ def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: T
     return [(k, start) for k, start in found if start is not None]
 
 
+def _fit_as_before(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
+                   last: Measurement) -> _Whole | None:
+    """Return the fit to a single marker whose print is smeared as in the last image, or None."""
+    if last.smear is None or not facing(sought.model, pose).all():
+        return None
+    found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True,
+                    AS_BEFORE_STEPS)
+    return None if found is None else _Whole(0, found)
+
+
 def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
                starts: list[tuple[int, SmearStart]]) -> _Whole | None:
     """Return the fit to the first marker whose smeared print fits the image, or None."""
@@ -284,12 +329,22 @@ def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
 
 
 def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Whole,
-               expected: PosePrior) -> Measurement:
-    """Return the measurement of the likelier attitude: of a fit, or of its mirrored one."""
+               expected: PosePrior, last: Measurement | None) -> Measurement:
+    """
+    Return the measurement of the likelier attitude: of a fit, or of its mirrored one.
+
+    :param last: the last measurement, if any: if its print was smeared, the mirrored attitude can
+        wait for an image with steps left.
+    """
     index, fitted = found
     start = _mirrored_body(sought, index, fitted.pose)
-    other = None if start is None else descend(
-        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens))
+    can_wait = last is not None and last.smear is not None
+    steps = MAX_STEPS - fitted.steps if can_wait else MOST_STEPS
+    other = None if start is None or steps < 1 else descend(
+        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True,
+        steps)
+    if start is not None and other is None and can_wait:
+        return _with_doubt(sought, found, last)
     return _choose_smeared(
         sought, index, [fitted] if other is None else [fitted, other], expected)
 
@@ -331,7 +386,8 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
     return Measurement(
         sought.neighbor.name, found.pose,
         sought.neighbor.markers[index].T_body_marker.translation,
-        found.covariance * DEVIATION_FACTOR**2, found.rms, None, alike=ALIKE_SHARE)
+        found.covariance * DEVIATION_FACTOR**2, found.rms, None, alike=ALIKE_SHARE,
+        smear=found.smear, lens=found.lens)
 
 
 def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:

@@ -53,7 +53,6 @@ from flock_follower.perception.look import (
     CameraMotion,
     DIRECTION_ERROR,
     Look,
-    MAX_TURN,
     MeasuredPose,
     reported,
     row_delay,
@@ -69,7 +68,7 @@ from flock_follower.perception.neighbor_filter import (
     UpdateOutcome,
 )
 from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
-from flock_follower.perception.pose import locate, target, track
+from flock_follower.perception.pose import locate, MAX_TURN, target, track
 from flock_follower.perception.range_tracking import Ranging, RangingParams
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 

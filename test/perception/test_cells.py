@@ -16,8 +16,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import cv2
 from marker_images import DICTIONARY
 import numpy as np
 import pytest
@@ -173,6 +175,26 @@ def test_no_other_marker_shows_code_in_even_light_or_shade(
                 image = shaded(image, rng.uniform(0.0, 2.0 * np.pi),
                                rng.uniform(-0.4, 0.4) * len(cells), rng.uniform(0.1, 0.6))
                 assert not shows_code(image, places(code), code), (marker_id, quarters)
+
+
+@pytest.mark.parametrize(('level', 'share'), [(255, 0.4), (200, 0.4), (115, 0.4), (30, 0.4)])
+def test_no_other_marker_that_is_half_hidden_shows_code(
+        level: int, share: float) -> None:
+    rng, dictionary = np.random.default_rng(2), DICTIONARY
+    radius = PX * math.sqrt(share * 16 / math.pi)
+    shown_tracked = 0
+    for marker_id in range(0, 50, 5):
+        code = code_of(marker_id)
+        for other in range(50):
+            if other == marker_id:
+                continue
+            image = picture(aruco.marker_code(dictionary, other))
+            x, y = (AROUND + 1 + rng.uniform(0.0, 4.0, 2)) * PX
+            cv2.circle(image, (round(x), round(y)), round(radius), level, -1)
+            assert not shows_code(image, places(code), code), (marker_id, other)
+            shown_tracked += shows_code(image, places(code), code, True)
+    # A saturated disc hides white and black cells alike: of a tracked marker few words are left.
+    assert shown_tracked <= (10 if level == 255 else 0)
 
 
 @pytest.mark.parametrize('off', [(9000.0, 0.0), (-9000.0, 50.0), (0.0, 1e6)])

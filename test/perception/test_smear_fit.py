@@ -92,6 +92,35 @@ def test_a_fit_ends_where_it_leads_no_farther(cells: float) -> None:
     assert np.linalg.norm(found.smear) == pytest.approx(cells, abs=0.15)
 
 
+def test_descent_from_last_smear_ends_where_a_searched_one_does() -> None:
+    for k, cells in enumerate((0.6, 1.0, 1.5, 1.8)):
+        before = known(fit_smeared(smeared(HERE, cells, 0.4, gamma=2.2), CAMERA, MODEL,
+                                   off(body(HERE), k)))
+        moved = facing((0.02 + 0.2 * CELL, -0.01, 1.5), (0.1, 0.3, 0.05))
+        image = smeared(moved, cells, 0.45, k, gamma=2.2)
+        found = known(descend(image, CAMERA, MODEL, SmearStart(
+            before.pose, before.smear, before.lens), True))
+        again = known(fit_smeared(image, CAMERA, MODEL, before.pose))
+        assert found.steps < again.steps or cells < 1.5
+        assert np.linalg.norm(found.smear - again.smear) < 0.05
+        aside, along = np.split((found.pose @ MOUNTED).translation - moved.translation, [2])
+        assert np.linalg.norm(aside) < 0.0015
+        assert abs(along[0]) < 0.02
+
+
+@pytest.mark.parametrize('cells', [1.0, 1.35])
+@pytest.mark.parametrize('marker_id', [0, 3, 17, 33])
+def test_smeared_mirrored_prints_are_refused(
+        marker_id: int, cells: float) -> None:
+    model = smear_model(Marker(marker_id, SIDE, MOUNTED), DICTIONARY)
+    own = marker_code(marker_id)
+    for mirrored in (own[::-1], own[:, ::-1]):
+        image = smeared(HERE, cells, 0.0, marker_id=marker_id, codes=mirrored)
+        # One word is its own mirror image.
+        assert (fit_smeared(image, CAMERA, model, body(HERE)) is None) != np.array_equal(
+            mirrored, own)
+
+
 @pytest.mark.parametrize('cells', [0.0, 1.0, 1.5])
 def test_no_other_marker_is_taken_for_it(cells: float) -> None:
     assert fit_smeared(smeared(HERE, max(cells, 0.3), 0.4), CAMERA, MODEL, body(HERE)) is not None
