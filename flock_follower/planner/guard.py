@@ -30,7 +30,6 @@ import math
 
 import numpy as np
 
-from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bound_keeping import (
     Bound,
@@ -51,7 +50,6 @@ from flock_follower.planner.bounds import (
     ZERO_VECTOR,
 )
 from flock_follower.planner.inputs import (
-    ACCELERATION_NOISE,
     MAX_ACCELERATION_AGE,
     Neighbor,
     OwnState,
@@ -59,31 +57,23 @@ from flock_follower.planner.inputs import (
     Prediction,
 )
 from flock_follower.planner.limits import limit_command, LimitedCommand
-from flock_follower.planner.memory import Loss, max_age, Memory
+from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
+from flock_follower.planner.retreat import APPROACH_NOISE, retreat
 from flock_follower.planner.scene import RECEIVED_SIGMAS, Scene, silent
 from flock_follower.planner.sight import FieldsOfView
-from flock_follower.planner.vectors import difference, scalar_product
+from flock_follower.planner.vectors import difference
 
 HORIZONTAL_AXES = np.array([1.0, 1.0, 0.0])  # factors of x, y, z
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backing off
 DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
-APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
-RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
-UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
-STOPPING_TIME = 0.6  # s at its own speed that a vehicle goes on when odometry is lost
-YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer
-YIELD_MAX = 3.0  # m by which the retreat is longer at most
 SIDESTEP_WEIGHT = 2.0  # of the step aside, at the end of the retreat; 1.0 is that straight away
 SIDESTEP_DEADZONE = 0.3  # share of the distance: no step aside to a neighbor so far on that side
 FAILING_TIME = 0.5  # s that a follower whose computer failed flies on before it stops and hovers
 COVER_WIDTH = 0.8  # m off the line of sight up to which one in sight covers another
-CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is overflown
-OVERFLIGHT_CLIMB = 1.0  # m of climb above a neighbor that is overflown
-MAX_HEIGHT_ABOVE = 0.3  # m: a neighbor lost higher than the vehicle by more may come down on it
 
 
 def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
@@ -175,110 +165,6 @@ def limit_to_retreat(bound: Bound, lost: Loss, position: Array, velocity: Sequen
     left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
     most = -stop(direction.tolist(), left, velocity, params).least
     return bound._replace(normal=direction.tolist(), least=min(bound.least, most))
-
-
-def retreat(lost: Loss, params: PlannerParams) -> float:
-    """
-    Return the largest retreat from a neighbor out of sight, m.
-
-    A leader is no faster than ``v_max``: the slower the vehicle may be, the shorter it retreats.
-    One that was lost above is out of view until it comes down, on the vehicle if that stayed: the
-    retreat from it has no such limit. The retreat is shorter by the distance beyond the band at
-    the loss, too.
-    """
-    distance = lost.free - float(lost.towards @ lost.origin)
-    beyond = max(distance - math.sqrt(params.law.d1), 0.0)
-    known = math.inf if lost.name else UNKNOWN_PLACE
-    lasting = math.inf if _is_above(lost) else RETREAT_TIME
-    return max(_longest_retreat(lost.approach, params, known, lasting) - beyond, 0.0)
-
-
-def _is_above(lost: Loss) -> bool:
-    """Return whether the neighbor was lost so high above the vehicle that it may come over it."""
-    return lost.height > float(lost.origin[2]) + MAX_HEIGHT_ABOVE
-
-
-def _longest_retreat(approach: float, params: PlannerParams, known: float = math.inf,
-                     lasting: float = RETREAT_TIME) -> float:
-    """Return the largest retreat, m, from a neighbor that approached at a speed, m/s."""
-    coming = params.retreat_max > 0.0 and approach > APPROACH_NOISE
-    return min(params.retreat_max, lasting * params.fastest, known) + (
-        coming * min(YIELD_TIME * approach, YIELD_MAX))
-
-
-def fallback_retreat_velocity(memory: Memory, scene: Scene,
-                              params: PlannerParams) -> Array | None:
-    """
-    Return the velocity (3,), m/s, that keeps the distance to an approaching neighbor, or None.
-
-    The gate brakes to it if odometry is lost. Of several approaching neighbors the nearest counts.
-    As out of sight, a neighbor that will approach in TRUSTED_TIME counts, too, and the retreat has
-    a limit.
-    """
-    if not params.guard or params.retreat_max == 0.0:
-        return None
-    coming, position = list[tuple[float, float, list[float]]](), scene.me.position.tolist()
-    for n in memory.flock.values():
-        if scene.me.stamp - n.stamp > max_age(n, params):
-            continue
-        it = scene.predictions[n.name]
-        x, y, _ = difference(position, it.position)
-        distance = math.hypot(x, y)
-        length = max(distance, SHORTEST)
-        away = [x / length, y / length, 0.0]
-        gap = distance - params.radius - n.member.radius - params.edges.near - params.edges.margin
-        approach = max(scalar_product(away, it.velocity), scalar_product(away, it.later))
-        speed = 0.0
-        if approach > APPROACH_NOISE:
-            speed = approach - min(params.guarding.closing_speed(gap)[0], 0.0)
-        if scalar_product(away, _newest_acceleration(n, memory)) > ACCELERATION_NOISE:
-            toward = max(-scalar_product(away, scene.me.velocity.tolist()), 0.0)
-            left = gap - STOPPING_TIME * toward - turned_path(
-                scalar_product(away, n.velocity.tolist()), params)
-            speed = max(speed, -left / (ODOMETRY_GAP - STOPPING_TIME))
-        if speed > 0.0:
-            coming.append((gap, min(speed, params.fastest, _longest_retreat(
-                approach, params) / ODOMETRY_GAP), away))
-    if not coming:
-        return None
-    _, speed, away = min(coming, key=lambda each: each[:2])
-    return speed * np.array(away)
-
-
-def _newest_acceleration(n: Neighbor, memory: Memory) -> list[float]:
-    """Return the acceleration of the newest estimate of a neighbor (3,), m/s^2, not smoothed."""
-    return memory.acceleration(n) if n.received or n.acceleration is None else (
-        n.acceleration.tolist())
-
-
-def turned_path(approach: float, params: PlannerParams) -> float:
-    """
-    Return how much nearer a neighbor that turns may be after ODOMETRY_GAP, m.
-
-    It accelerates towards the vehicle by ``leader_acceleration_max``, up to ``v_max``.
-
-    :param approach: its speed towards the vehicle now, m/s.
-    """
-    most = params.leader_acceleration_max
-    speeding = min(max(params.fastest - approach, 0.0) / most, ODOMETRY_GAP) if most > 0.0 else 0.0
-    return approach * ODOMETRY_GAP + most * speeding * (ODOMETRY_GAP - 0.5 * speeding)
-
-
-def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
-    """
-    Return the least height, m, at which an approaching neighbor out of sight may pass below.
-
-    Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
-    of ``altitude_max`` is no ceiling.
-
-    :param held: altitude to hold, m.
-    """
-    left = retreat(lost, params) - lost.retreat_distance(position)
-    overtaken = lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
-    if (params.altitude_max >= PlannerParams.altitude_max or params.retreat_max == 0.0
-            or not overtaken or _is_above(lost)):
-        return -math.inf
-    return held + OVERFLIGHT_CLIMB
 
 
 def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, scene: Scene,
