@@ -89,7 +89,7 @@ def test_flocks_keep_apart_and_lose_nobody(name: str, run: int, changes: dict[st
     assert figures['time_in_band'].min() >= in_band
 
 
-def test_in_a_ring_it_stays_ahead_of_leader_whose_marker_is_there() -> None:
+def test_in_a_ring_it_stays_ahead_of_its_leader() -> None:
     flights, _ = flown('short', [0], flock={
         'followers': 4, 'formation': 'ring', 'faces': ('back', 'front', 'left', 'right')})
     x, y, _ = (flights.positions[0, -1, 3] - flights.positions[0, -1, 0]).tolist()
