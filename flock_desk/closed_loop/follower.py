@@ -37,6 +37,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.follower import ControlCycle, Follower, Listener, Tick
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import ENGAGE_TIME, Operation, Scenario, VioErrors
+from flock_desk.sensors.sensing import DIRECTIONS
 from flock_follower.acceleration_messages import AccelerationState, with_acceleration
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
@@ -284,8 +285,12 @@ def _params(scenario: Scenario, guard: bool, law: type[FlockingParams],
     """Return the planner's parameters of a vehicle."""
     params = scenario.flight.planner(guard)
     params = replace(params, law=law(**vars(params.law)))
-    return params if scenario.flock is None else replace(params, vehicles={
-        other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER)
+    if scenario.flock is None:
+        return params
+    normals = [DIRECTIONS[side] for side in scenario.flock.faces]
+    faces = tuple(math.atan2(y, x) for x, y, _ in normals if x or y)
+    return replace(params, vehicles={
+        other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER, faces=faces)
         for other in scenario.flock.names if other != name})
 
 

@@ -30,7 +30,6 @@ import math
 
 import numpy as np
 
-from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bound_keeping import (
     Bound,
@@ -58,30 +57,23 @@ from flock_follower.planner.inputs import (
     Prediction,
 )
 from flock_follower.planner.limits import limit_command, LimitedCommand
-from flock_follower.planner.memory import Loss, max_age, Memory
+from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
+from flock_follower.planner.retreat import APPROACH_NOISE, retreat
 from flock_follower.planner.scene import RECEIVED_SIGMAS, Scene, silent
 from flock_follower.planner.sight import FieldsOfView
-from flock_follower.planner.vectors import difference, scalar_product
+from flock_follower.planner.vectors import difference
 
 HORIZONTAL_AXES = np.array([1.0, 1.0, 0.0])  # factors of x, y, z
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backing off
 DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
-APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
-RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
-UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
-YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer
-YIELD_MAX = 3.0  # m by which the retreat is longer at most
 SIDESTEP_WEIGHT = 2.0  # of the step aside, at the end of the retreat; 1.0 is that straight away
 SIDESTEP_DEADZONE = 0.3  # share of the distance: no step aside to a neighbor so far on that side
 FAILING_TIME = 0.5  # s that a follower whose computer failed flies on before it stops and hovers
 COVER_WIDTH = 0.8  # m off the line of sight up to which one in sight covers another
-CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is overflown
-OVERFLIGHT_CLIMB = 1.0  # m of climb above a neighbor that is overflown
-MAX_HEIGHT_ABOVE = 0.3  # m: a neighbor that is higher than the vehicle by more is not overflown
 
 
 def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
@@ -173,75 +165,6 @@ def limit_to_retreat(bound: Bound, lost: Loss, position: Array, velocity: Sequen
     left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
     most = -stop(direction.tolist(), left, velocity, params).least
     return bound._replace(normal=direction.tolist(), least=min(bound.least, most))
-
-
-def retreat(lost: Loss, params: PlannerParams) -> float:
-    """
-    Return the largest retreat from a neighbor out of sight, m.
-
-    The leader is assumed to be no faster than ``v_max``, so a lower ``v_max`` shortens the
-    retreat. The retreat is shorter by the distance beyond the band at the loss.
-    """
-    distance = lost.free - float(lost.towards @ lost.origin)
-    beyond = max(distance - math.sqrt(params.law.d1), 0.0)
-    known = math.inf if lost.name else UNKNOWN_PLACE
-    return max(_longest_retreat(lost.approach, params, known) - beyond, 0.0)
-
-
-def _longest_retreat(approach: float, params: PlannerParams, known: float = math.inf) -> float:
-    """Return the largest retreat, m, from a neighbor that approached at a speed, m/s."""
-    coming = params.retreat_max > 0.0 and approach > APPROACH_NOISE
-    return min(params.retreat_max, RETREAT_TIME * params.fastest, known) + (
-        coming * min(YIELD_TIME * approach, YIELD_MAX))
-
-
-def fallback_retreat_velocity(memory: Memory, scene: Scene,
-                              params: PlannerParams) -> Array | None:
-    """
-    Return the velocity (3,), m/s, that keeps the distance to an approaching neighbor, or None.
-
-    The gate brakes to it if odometry is lost. Of several approaching neighbors the nearest counts.
-    A neighbor that will approach in TRUSTED_TIME counts, too, and the retreat is limited, as for a
-    neighbor out of sight.
-    """
-    if not params.guard or params.retreat_max == 0.0:
-        return None
-    coming, position = list[tuple[float, float, list[float]]](), scene.me.position.tolist()
-    for n in memory.flock.values():
-        if scene.me.stamp - n.stamp > max_age(n, params):
-            continue
-        it = scene.predictions[n.name]
-        x, y, _ = difference(position, it.position)
-        distance = math.hypot(x, y)
-        length = max(distance, SHORTEST)
-        away = [x / length, y / length, 0.0]
-        approach = max(scalar_product(away, it.velocity), scalar_product(away, it.later))
-        if approach > APPROACH_NOISE:
-            coming.append((distance - params.radius - n.member.radius, approach, away))
-    if not coming:
-        return None
-    gap, approach, away = min(coming, key=lambda each: each[:2])
-    gap -= params.edges.near
-    speed = approach - min(params.guarding.closing_speed(gap - params.edges.margin)[0], 0.0)
-    speed = min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP)
-    return speed * np.array(away)
-
-
-def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
-    """
-    Return the least height, m, at which an approaching neighbor out of sight may pass below.
-
-    Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
-    of ``altitude_max`` is no ceiling.
-
-    :param held: altitude to hold, m.
-    """
-    left = retreat(lost, params) - lost.retreat_distance(position)
-    overtaken = lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
-    if (params.altitude_max >= PlannerParams.altitude_max or params.retreat_max == 0.0
-            or not overtaken or lost.height > float(lost.origin[2]) + MAX_HEIGHT_ABOVE):
-        return -math.inf
-    return held + OVERFLIGHT_CLIMB
 
 
 def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, scene: Scene,

@@ -98,7 +98,7 @@ class Loss(NamedTuple):
     """Coordinate along ``towards`` up to which the last line of sight was free, m, in the
     frame of the odometry."""
     approach: float
-    """Horizontal speed of approach at the loss, m/s."""
+    """Horizontal speed of approach at the loss, m/s; without a place, the largest possible one."""
     height: float
     """Height of the neighbor at the loss, m."""
     side: Array
@@ -163,6 +163,8 @@ class Memory(NamedTuple):
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
     disturbance: Any = None
     """See ``relative.Disturbance``."""
+    coming: float = 0.0
+    """Speed, m/s, with which a neighbor may come while odometry is lost; see ``retreat``."""
     switched: float = -math.inf
     """Time at which odometry was last lost or returned, s: the frame changed then."""
 

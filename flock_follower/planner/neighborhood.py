@@ -191,13 +191,16 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     """
     Return the acceleration (3,), m/s^2, without limits, and the fade-in to that of the law.
 
-    In TRACK it is that of the law, or of the fade-in; in COAST zero; else it brakes.
+    In TRACK it is that of the law, or of the fade-in; in COAST zero; else it brakes to a hover. If
+    odometry jumped while a neighbor came, it retreats until it sees one.
 
     :param velocity: own velocity when the command acts (3,), m/s.
     """
     if state is not State.TRACK:
+        lost = memory.lost
+        retreating = lost.approach * lost.towards if lost and not lost.name else np.zeros(3)
         return (np.zeros(3) if state is State.COAST else brake(
-            velocity, params.strongest, params.brake_time_constant)), None
+            velocity + retreating, params.strongest, params.brake_time_constant)), None
     flock = neighbors.flock
     offsets = _offsets(neighbors, me, params)
     differences = np.array([n.velocity for n in flock]) - me.velocity

@@ -229,8 +229,8 @@ class PlannerParams(Checked):
         'earlier', live=True)
     retreat_max: float = parameter(
         4.0, Range(0.0, 10.0, 'm'),
-        'largest retreat from a neighbor out of sight, besides 2 s of v_max; up to 3 m more if '
-        'it was approaching; 0: no retreat', live=True)
+        'largest retreat from a neighbor out of sight, besides 2 s of v_max if it was not lost '
+        'above; up to 3 m more if it was approaching; 0: no retreat', live=True)
     resume_timeout: float = parameter(
         30.0, Range(0.1, 3600.0, 's'),
         'time without a followed neighbor, up to which the planner follows again by itself; then '

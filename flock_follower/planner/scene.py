@@ -183,7 +183,8 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
     if not near:  # the odometry jumped: the neighbor is at the near edge of the band, or farther
         free = float(towards @ me.position) + math.sqrt(params.law.d0)
-        return Loss(towards, me.position, free, 0.0, float(me.position[2]), np.zeros(3), '')
+        coming = 0.0 if scene.blinded else memory.coming
+        return Loss(towards, me.position, free, coming, float(me.position[2]), np.zeros(3), '')
     n = min(near, key=lambda n: (math.dist(n.position, me.position), n.name))
     x, y, _ = expected_now(n, memory, me.stamp, params).position - me.position
     if math.hypot(x, y) > OVERHEAD_DISTANCE:

@@ -34,18 +34,13 @@ import numpy as np
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner import relative
 from flock_follower.planner.bound_keeping import SEPARATION
-from flock_follower.planner.guard import (
-    climb_range,
-    constrain,
-    fallback_retreat_velocity,
-    overflight,
-    retreat,
-)
+from flock_follower.planner.guard import climb_range, constrain
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import ingest, Memory, update_pending
 from flock_follower.planner.modes import blind, next_state, odometry_delay, odometry_fault, State
 from flock_follower.planner.neighborhood import last_known, nominal, reports
 from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.retreat import fallback_retreat, overflight, retreat
 from flock_follower.planner.scene import Decision, expected_now, Scene, survey
 from flock_follower.planner.sight import FieldsOfView, Occlusion, occlusion
 from flock_follower.planner.vertical_yaw import Altitude, face_yaw, search_yaw, turn_rate
@@ -88,6 +83,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     neighbors = scene.neighbors
     altitude, vertical = _altitude(memory, scene, ground, flown, params, elapsed)
     velocity = me.velocity + flown + memory.pending
+    fallback = fallback_retreat(memory, scene, params)
     unlimited, fading = nominal(memory, state, me, velocity, neighbors, params)
     command = constrain(unlimited, vertical, altitude.climb, memory, scene, velocity, view, params)
     if me.stamp - memory.switched < relative.SETTLING_TIME:
@@ -103,11 +99,12 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         faced=neighbors.faced.name if neighbors.faced else memory.faced,
         leader=last_known(memory, neighbors), looking=scene.leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
-        pending=update_pending(memory, command.acceleration, elapsed, params))
+        pending=update_pending(memory, command.acceleration, elapsed, params),
+        coming=0.0 if fallback is None else fallback.approach)
     return memory, Decision(
         state, reason, command.acceleration, yaw,
         turn_rate(last_yaw, yaw, me, params, elapsed), command.separation_axis,
-        fallback_retreat_velocity(memory, scene, params), stamp,
+        None if fallback is None else fallback.velocity, stamp,
         command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
 
@@ -201,6 +198,10 @@ def _yaw(last: float, memory: Memory, scene: Scene, params: PlannerParams,
     if faced is not None:
         # Seen again during a turn: the yaw commanded last is where it would overshoot to.
         return face_yaw(me.yaw if memory.params is None else last, me, faced, params, elapsed)
+    lost = memory.lost
+    if lost is not None and not lost.name and memory.jumped is not None:
+        ahead = Neighbor('', me.stamp, me.position + lost.towards, np.zeros(3))
+        return search_yaw(last, me, ahead, me.stamp - memory.jumped, params, elapsed)
     if scene.state is State.SEARCH:  # it looks round, anticlockwise
         return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
     return last

@@ -89,6 +89,13 @@ def test_flocks_keep_apart_and_lose_nobody(name: str, run: int, changes: dict[st
     assert figures['time_in_band'].min() >= in_band
 
 
+def test_in_a_ring_it_stays_ahead_of_its_leader() -> None:
+    flights, _ = flown('short', [0], flock={
+        'followers': 4, 'formation': 'ring', 'faces': ('back', 'front', 'left', 'right')})
+    x, y, _ = (flights.positions[0, -1, 3] - flights.positions[0, -1, 0]).tolist()
+    assert abs(np.arctan2(y, x)) < 0.15  # rad; without the marker in front it leaves that place
+
+
 def test_ring_with_messages_keeps_clear_of_unseen_leader() -> None:
     """In this run it strolled on to 0.25 m from one of the ring around it."""
     _, figures = flown('flock_ring', [51_000_003], duration=13.0,

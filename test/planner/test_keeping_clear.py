@@ -21,6 +21,8 @@ from dataclasses import replace
 import math
 
 from flown import Follower, own, seen, STILL
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from numpy.typing import ArrayLike
 import pytest
@@ -33,15 +35,13 @@ from flock_follower.planner.guard import (
     climb_range,
     fences,
     limit_to_retreat,
-    overflight,
-    retreat,
-    RETREAT_TIME,
     sort_bounds,
 )
 from flock_follower.planner.inputs import Neighbor, Prediction
 from flock_follower.planner.limits import LimitedCommand
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import Member, PlannerParams
+from flock_follower.planner.retreat import overflight, retreat, RETREAT_TIME
 from flock_follower.planner.scene import across_path
 
 PARAMS = PlannerParams(v_max=2.0)
@@ -94,6 +94,17 @@ def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: 
     assert retreat(lost, PARAMS) == pytest.approx(PARAMS.retreat_max + farther)
     slow = replace(PARAMS, v_max=0.5)
     assert retreat(lost, slow) == pytest.approx(RETREAT_TIME * 0.5 + farther)
+
+
+@given(st.floats(-5.0, 5.0), st.floats(0.1, 3.0), st.floats(0.0, 10.0), st.floats(0.0, 3.0))
+def test_only_one_lost_above_is_retreated_from_that_far(
+        higher: float, v_max: float, most: float, approach: float) -> None:
+    params = replace(PARAMS, v_max=v_max, retreat_max=most)
+    more = min(2.0 * approach, 3.0) if most > 0.0 and approach > 0.1 else 0.0
+    far = most if higher > 0.3 else min(most, RETREAT_TIME * v_max)
+    lost = LOST._replace(height=higher, approach=approach)
+    assert retreat(lost, params) == pytest.approx(far + more)
+    assert retreat(lost._replace(name=''), params) <= 1.0 + more + 1e-9
 
 
 COMING = LOST._replace(approach=1.0, side=np.array([0.0, 1.0, 0.0]))

@@ -21,15 +21,26 @@ import math
 from typing import Any
 
 from flown import commanded, Follower, own, PARAMS, seen
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import wrap_angle
-from flock_follower.planner.guard import retreat, RETREAT_TIME
 from flock_follower.planner.inputs import FRESH, predict
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.retreat import (
+    DRIFT_SPEED,
+    fallback_retreat,
+    FallbackRetreat,
+    retreat,
+    RETREAT_TIME,
+    STOPPING_TIME,
+)
+from flock_follower.planner.scene import survey
 from flock_follower.planner.step import step
 
 AHEAD = np.array([2.0, 0.0, 0.0])
@@ -134,18 +145,33 @@ def test_the_retreat_is_shorter_by_the_distance_beyond_the_band(distance: float,
     assert retreat(loss, PARAMS) == pytest.approx(moved, abs=0.01)
 
 
-@pytest.mark.parametrize('speed', [1.8, -1.8])
-def test_unknown_place_after_odometry_jump_soon_stops_it(speed: float) -> None:
+@pytest.mark.parametrize(('speed', 'coming', 'most'), [(1.8, 0.0, 2.0), (-1.8, 1.8, 4.2)])
+def test_unknown_place_after_odometry_jump_soon_stops_it(speed: float, coming: float,
+                                                         most: float) -> None:
     params = PlannerParams(v_max=2.0)
     follower = Follower(params, params.response_time)
     follower.velocity = np.array([speed, 0.0, 0.0])
     for _ in range(10):
         follower.tick(seen(follower.now, follower.position + AHEAD, follower.velocity))
     follower.jumped, begin = np.array([0.0, 5.0, 0.0]), follower.position
-    for _ in range(40):
+    for _ in range(60):
         assert follower.tick().state in (State.COAST, State.HOLD)
-    assert math.dist(begin, follower.position) < 2.0
-    assert follower.memory.lost is not None and follower.memory.lost.approach == 0.0
+    assert most - 1.0 < math.dist(begin, follower.position) < most
+    assert math.hypot(*follower.velocity) < 0.1
+    lost_then = follower.memory.lost
+    assert lost_then is not None and lost_then.approach == pytest.approx(coming, abs=0.01)
+
+
+def test_after_odometry_jump_it_looks_to_both_sides() -> None:
+    follower = Follower()
+    for _ in range(5):
+        follower.tick(seen(follower.now))
+    follower.jumped, yaws = np.array([0.0, 5.0, 0.0]), []
+    for _ in range(60):
+        follower.tick()
+        yaws.append(follower.yaw)
+    assert yaws[3] == pytest.approx(0.0, abs=1e-6)
+    assert max(yaws[:30]) > 0.75 and min(yaws[30:]) < -0.75
 
 
 @pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])
@@ -202,3 +228,48 @@ def test_it_names_velocity_keeping_distance_if_odometry_is_lost(
         assert decision.retreat is None
     else:
         assert decision.retreat == pytest.approx(retreat, abs=0.01)
+
+
+def fallback(distance: float, closing: float, turning: float, own_speed: float,
+             params: PlannerParams) -> FallbackRetreat | None:
+    """Return the retreat from a leader ahead; speeds towards it, and its acceleration, are +."""
+    n = seen(0.0, (distance, 0.0, 2.0), (-closing, 0.0, 0.0),
+             acceleration=np.array([-turning, 0.0, 0.0]))
+    me = own(0.0, velocity=(own_speed, 0.0, 0.0))
+    memory, scene = survey(Memory(now=0.0, own=me, neighbors={'leader': n}), me, State.TRACK,
+                           False, params, params.period)
+    return fallback_retreat(memory, scene, params)
+
+
+@pytest.mark.parametrize(('distance', 'closing', 'turning', 'v_max'), [
+    (2.12, 0.0, 0.0, 0.5), (2.12, 0.0, 0.15, 2.0), (2.3, -0.5, 0.0, 1.0), (1.6, -1.0, 0.15, 2.0),
+    (2.3, -1.9, 0.5, 2.0)], ids=['hovers', 'noise', 'goes on', 'near', 'slows down'])
+def test_nobody_who_could_come_near_causes_no_retreat(distance: float, closing: float,
+                                                      turning: float, v_max: float) -> None:
+    params = replace(PARAMS, v_max=v_max)
+    assert fallback(distance, closing, turning, max(-closing, 0.0), params) is None
+
+
+@given(st.floats(1.4, 2.8), st.floats(-1.0, 1.0), st.floats(0.21, 2.0), st.floats(0.0, 1.0),
+       st.floats(0.1, 3.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(-1.0, 1.0))
+def test_retreat_from_one_that_turns_leaves_the_margin(
+        distance: float, share: float, turning: float, own_share: float, v_max: float,
+        speeding: float, fastest: float, wrong: float) -> None:
+    """At the end of the gap, for every leader within its limits, or the retreat is the longest."""
+    params = replace(PARAMS, v_max=v_max)
+    own_speed, closing = own_share * v_max, share * v_max
+    found = fallback(distance, closing, turning, own_speed, params)
+    speed = 0.0 if found is None else math.hypot(*found.velocity)
+    assert speed <= v_max * (1.0 + 1e-9)
+    coming = 0.0 if found is None else found.approach
+    longest = min(params.retreat_max, RETREAT_TIME * v_max) + min(2.0 * coming, 3.0)
+    assert speed * ODOMETRY_GAP <= longest * (1.0 + 1e-9)
+    permitted = min(v_max, longest / ODOMETRY_GAP)
+    # The leader accelerates by a part of the assumed limit, up to a part of v_max.
+    rate, end = speeding * params.leader_acceleration_max, max(closing, fastest * v_max)
+    gained = min((end - closing) / rate if rate > 0.0 else ODOMETRY_GAP, ODOMETRY_GAP)
+    came = closing * ODOMETRY_GAP + rate * gained * (ODOMETRY_GAP - 0.5 * gained)
+    flown = (speed + (DRIFT_SPEED * wrong if speed else 0.0)) * (ODOMETRY_GAP - STOPPING_TIME)
+    left = distance - came - own_speed * STOPPING_TIME + flown
+    assert left >= params.edges.near + params.edges.margin - 1e-9 or (
+        speed >= permitted * (1.0 - 1e-9))
