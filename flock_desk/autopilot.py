@@ -62,8 +62,8 @@ def parser() -> argparse.ArgumentParser:
     new.add_argument('--yaw', type=within(Range(-360.0, 360.0, 'degrees')), default=0.0,
                      metavar='DEG', help='at the start, anticlockwise from east (%(default)s)')
     new.add_argument('--param-file', default='', metavar='FILE',
-                     help='set the parameters of a file such as config/px4.params, but those '
-                     'for forwarded odometry')
+                     help='set the parameters in a file such as config/px4.params, except '
+                     'those for forwarded odometry')
     new.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
                      help='set a parameter of the autopilot; may be repeated')
     new.add_argument('--log', default='', metavar='FILE.npz',

@@ -88,7 +88,7 @@ def trajectory(make: Make, command: Command) -> Any:
 
     Position and velocity are NaN: they are not commanded. The acceleration of a joint 'separation'
     is ``separation_axis``, the height of a joint 'altitude' is ``altitude``, the velocity of a
-    joint 'retreat' is ``retreat``. A receiver of only the first joint ignores them.
+    joint 'retreat' is ``retreat``. A receiver that reads only the first joint ignores the others.
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)

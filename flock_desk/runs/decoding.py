@@ -52,7 +52,7 @@ def decoded_ahead(messages: Iterable[BagMessage], topics: Collection[str]
 
 
 def _decode(message: BagMessage) -> DecodedImage | None:
-    """Return the decoded image; None if it is damaged: whoever needs it finds the reason."""
+    """Return the decoded image; None if it is damaged: the user decodes it again for the error."""
     try:
         image = deserialize(message.data, message.msgtype)
         start = time.thread_time()

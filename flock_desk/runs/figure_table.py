@@ -39,9 +39,9 @@ class Figure(NamedTuple):
     A figure, or a group of them.
 
     :param words: name and unit on the page.
-    :param shown: whether it is printed on the console without a bound, too.
-    :param demo: its bounds in ``demo``; :param fly: in ``fly``; :param external: in ``fly`` on an
-        external autopilot, if they are others.
+    :param shown: whether the console shows it even if it has no bound.
+    :param demo: its bounds in ``demo``; :param fly: its bounds in ``fly``.
+    :param external: its bounds in ``fly`` on an external autopilot, if they differ.
     :param load: how far beyond its bounds a busy machine can push it: a number, the name of a
         limit of the flight, or LATE.
     """

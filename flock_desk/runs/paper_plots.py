@@ -75,7 +75,7 @@ def styled() -> Any:
 
 @styled()
 def save(figure: Figure, path: Path) -> str:
-    """Write a figure in every kind, beside each other, and return the names in one."""
+    """Write a figure in each file format; return the names of the files, as NAME.png/.svg/.pdf."""
     for kind in KINDS:
         with whole_file(path.with_suffix(f'.{kind}')) as file:
             figure.savefig(file, format=kind, dpi=300, metadata=_METADATA[kind])

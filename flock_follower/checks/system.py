@@ -89,7 +89,11 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
 
 
 def _shared_memory(machine: Machine, image: int) -> Finding:
-    """Check the shared memory; ``image`` is the size of the largest image, bytes."""
+    """
+    Check free space in /dev/shm, segments of killed processes, and the room for an image.
+
+    :param image: size of the largest image, bytes.
+    """
     free = machine.shared_memory_free
     return first(
         'shared memory',

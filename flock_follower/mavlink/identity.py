@@ -207,8 +207,8 @@ class Identity:
     def conflict(self, now: float) -> str:
         """Return the evidence that two vehicles, or two bridges, send, or ''."""
         if len(self._rivals) == _RIVAL_BEATS and now - self._rivals[0] <= FINDING:
-            return (f'{SECOND_BRIDGE}: end one, a second mavlink_bridge or MAVROS; or set '
-                    'source_system')
+            return (f'{SECOND_BRIDGE}: stop one of them (a second mavlink_bridge, or '
+                    'MAVROS), or give this one another source_system')
         evidence = [name for name, sources in (
             ('times of boot', self._boots), ('positions', self._places),
             ('sequence numbers', self._numbers), ('addresses', self._addresses))

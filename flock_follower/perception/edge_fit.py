@@ -215,7 +215,7 @@ def _search_spacing(lines: Lines) -> tuple[float, float]:
 
 
 #: Least share of the edges that agree with an accepted pose.
-MIN_INLIERS = 0.5
+MIN_INLIER_SHARE = 0.5
 #: Largest RMS of the residuals of an accepted pose, px.
 MAX_RMS = 0.4
 #: Largest residual of an edge in place, px, or three times the RMS if that is more.
@@ -262,8 +262,8 @@ class EdgeFit(NamedTuple):
     ``pose`` is ``T_camera_body``; ``center`` (3,) is in the middle of the edges, in the camera's
     optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
     vector r in R_true = exp(r) R. ``rms`` is that of the residuals, px, ``chi2`` the mean of
-    their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
-    share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found;
+    their squares over their variances, ``degrees`` the degrees of freedom left;
+    ``inlier_share`` the share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found;
     ``blur`` is that, a share of the narrowest cell, and ``bloom`` the shift, px, both of the axis
     with more.
     """
@@ -274,7 +274,7 @@ class EdgeFit(NamedTuple):
     rms: float
     chi2: float
     degrees: float
-    inliers: float
+    inlier_share: float
     spacing: tuple[float, float]
     blur: float
     bloom: float
@@ -290,8 +290,8 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
     """
     Return the pose near ``start``, ``T_camera_body``, or None if the image does not show it.
 
-    More than MIN_INLIERS of the edges must be in place, within MAX_RMS. ``start`` may be off by
-    half a cell of the marker in the image.
+    More than MIN_INLIER_SHARE of the edges must be in place, within MAX_RMS. ``start`` may be off
+    by half a cell of the marker in the image.
 
     :param spacing: of the profiles, px, that suited the image before; then ``start`` may be off
         by four times as much.
@@ -341,14 +341,14 @@ def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
     square = float(last.weights.dot(last.squares)) / degrees
     in_place = found.found & (last.squares < max(MAX_INLIER_ERROR**2, 9.0 * square))
-    inliers, rms = np.count_nonzero(in_place) / len(lines.model), math.sqrt(square)
+    inlier_share, rms = np.count_nonzero(in_place) / len(lines.model), math.sqrt(square)
     covariance = normal_covariance(last.information)
-    if covariance is None or not (inliers > MIN_INLIERS and rms < MAX_RMS):
+    if covariance is None or not (inlier_share > MIN_INLIER_SHARE and rms < MAX_RMS):
         return None
     weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(
         pose, lines.center, covariance[:6, :6], rms, float(weights.dot(last.squares)) / degrees,
-        degrees, inliers, _widen_for_bloom(spacing, last.step[6:]),
+        degrees, inlier_share, _widen_for_bloom(spacing, last.step[6:]),
         max(width / cell for width, cell in zip(blur, lines.narrowest)),
         float(np.abs(last.step[6:]).max()), lines, last.residual, weights)
 

@@ -69,10 +69,10 @@ SIGMA_FLOOR = 0.05
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
 #: Of a marker that is not tracked yet, more than this share of the edges must agree.
-FOUND_INLIERS = 0.8
+FOUND_INLIER_SHARE = 0.8
 #: If more than this share of the edges agrees, to within SHARP_RMS, none of them is smeared: if
 #: the code is not shown, either they are not of the marker, or something covers it.
-SHARP_INLIERS = 0.7
+SHARP_INLIER_SHARE = 0.7
 SHARP_RMS = 0.15  # px
 #: Share of the variances of errors that are alike from image to image, unless edges are plain.
 ALIKE_SHARE = 0.8
@@ -80,7 +80,7 @@ ALIKE_SHARE = 0.8
 #: MAX_PLAIN_BLOOM.
 PLAIN_BLUR = 0.2
 #: Least share of plain edges that agree.
-PLAIN_INLIERS = 0.9
+PLAIN_INLIER_SHARE = 0.9
 #: If edges are blurred by more than this share of a cell (1 sigma), the whole print says more.
 RUN_TOGETHER = 0.25
 #: If a print that is followed smeared is blurred by more than this, cells, it has no edges to fit.
@@ -132,9 +132,10 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
             return None
     if found is None:  # it is smeared, or it moved farther than expected
         found, whole = _fit_around(image, camera, sought, expected.pose, last if smeared else None)
-    if found is not None and found.inliers < PLAIN_INLIERS:  # the others may be out of reach
+    # The other edges may be out of reach.
+    if found is not None and found.inlier_share < PLAIN_INLIER_SHARE:
         again = fit(image, camera, found.lines.model, found.pose)
-        found = again if again is not None and again.inliers > found.inliers else found
+        found = again if again is not None and again.inlier_share > found.inlier_share else found
     blurred = found is not None and found.blur > RUN_TOGETHER and (
         len(found.lines.model.codes) == 1)
     if whole is None and blurred:
@@ -212,7 +213,8 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
-    fits = [one for one in near if one.inliers > FOUND_INLIERS and _find_shown(image, one).all()]
+    fits = [one for one in near
+            if one.inlier_share > FOUND_INLIER_SHARE and _find_shown(image, one).all()]
     if not fits:
         return None if not smeared or any(map(_sharp, near)) else _without_edges(
             image, camera, sought, index, starts, expected)
@@ -239,7 +241,7 @@ def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: in
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     for start in ippe(corners, camera, marker.side_length):
         found = fit(image, camera, alone, start @ T_marker_body)
-        if found is not None and found.inliers > FOUND_INLIERS:
+        if found is not None and found.inlier_share > FOUND_INLIER_SHARE:
             chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found))
             best = choose([chosen, *_mirrored_hypotheses(camera, found)], PosePrior(None, up))
             return angle(best.chosen.pose, pose) > MAX_TURN
@@ -293,11 +295,11 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
 def _plain(found: EdgeFit) -> bool:
     """Return whether the edges have no lasting errors by smear, over-exposure or reflexes."""
     return (found.blur < PLAIN_BLUR and found.bloom < MAX_PLAIN_BLOOM
-            and found.inliers > PLAIN_INLIERS)
+            and found.inlier_share > PLAIN_INLIER_SHARE)
 
 
 def _sharp(found: EdgeFit) -> bool:
-    return found.inliers > SHARP_INLIERS and found.rms < SHARP_RMS
+    return found.inlier_share > SHARP_INLIER_SHARE and found.rms < SHARP_RMS
 
 
 def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,

@@ -142,7 +142,7 @@ _STAMP_TOLERANCE = 1e-6  # s: stamps that differ by less are of one image
 
 
 class Occlusion(NamedTuple):
-    """The neighbor is occluded."""
+    """A neighbor is missing in consecutive images that should show it."""
 
     lost: float
     """Stamp of the last estimate before, s."""
@@ -153,7 +153,7 @@ class Occlusion(NamedTuple):
 def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
               frames: Sequence[float], view: FieldsOfView, forward: float) -> Occlusion | None:
     """
-    Return the occlusion of a neighbor, or None.
+    Return the occlusion of a neighbor, whatever hides it; None if it is not occluded.
 
     :param before: the occlusion in the last step.
     :param n: its newest estimate; None if there is none.

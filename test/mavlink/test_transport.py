@@ -241,6 +241,9 @@ def test_an_error_has_its_name_and_a_remedy(number, word):
     (0o660, 0, '61-flight-controller.rules')])
 def test_a_serial_port_without_permission_names_its_group(monkeypatch, mode, group, said):
     name = grp.getgrgid(group).gr_name
-    monkeypatch.setattr(os, 'stat', lambda _: SimpleNamespace(st_gid=group, st_mode=mode))
-    text = explain_error(PermissionError(errno.EACCES, 'Permission denied'), '/dev/ttyACM0')
+    port, stat = '/dev/ttyACM0', os.stat
+    # Other threads ask for other files.
+    monkeypatch.setattr(os, 'stat', lambda path, *args, **options: SimpleNamespace(
+        st_gid=group, st_mode=mode) if path == port else stat(path, *args, **options))
+    text = explain_error(PermissionError(errno.EACCES, 'Permission denied'), port)
     assert text.startswith('Permission denied (EACCES): ') and said.format(name=name) in text

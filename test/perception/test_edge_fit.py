@@ -103,7 +103,7 @@ def test_edges_in_a_shadow_count() -> None:
     image = render(CAMERA, {3: pose}, black=10.0)
     image[:, :round(CAMERA.project(pose.translation)[0, 0])] //= 5
     found = fitted(image, pose)
-    assert found.inliers > 0.85
+    assert found.inlier_share > 0.85
     assert np.linalg.norm(error(found, pose)[3:]) < 0.05
 
 
@@ -128,7 +128,7 @@ def test_over_exposed_edges_are_followed_from_image_to_image() -> None:
         start = Transform(pose.rotation, pose.translation
                           + np.random.default_rng(seed).normal(0.0, 0.001, 3))
         again = fitted(image, start, spacing=found.spacing)
-        assert again.inliers > 0.9
+        assert again.inlier_share > 0.9
         assert np.abs(error(again, pose)[:2]).max() < 0.0005
 
 
