@@ -263,9 +263,9 @@ class EdgeFit(NamedTuple):
     optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
     vector r in R_true = exp(r) R. ``rms`` is that of the residuals, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left;
-    ``inlier_share`` the share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found;
-    ``blur`` is that, a share of the narrowest cell, and ``bloom`` the shift, px, both of the axis
-    with more.
+    ``inlier_share`` the share of edges in place. ``spacing``, px, is that of the profiles which
+    suits the blur found; ``blur`` is that, a share of the narrowest cell, and ``bloom`` the shift,
+    px, both of the axis with more.
     """
 
     pose: Transform

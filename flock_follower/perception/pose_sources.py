@@ -151,7 +151,8 @@ class PoseSources:
             return UNTIMELY, f'{name}: {stamp - newest:.2f} s after the odometry'
         frame = state.frame.lstrip('/')
         odom, T_body_frame = odom_frame.lstrip('/'), self._mounting(frame)
-        if frame in self.frames and frame in (BASE, odom):
+        # Without odometry the camera's frame is that of the odometry, on purpose.
+        if not self._tracker.alone and frame in self.frames and frame in (BASE, odom):
             return UNKNOWN_FRAME, (f'{name}: frame {frame!r} is also that of a camera, whose axes '
                                    'are others: camera_info must have a frame of its own')
         if T_body_frame is None and (not frame or frame != odom):

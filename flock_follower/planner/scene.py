@@ -178,7 +178,9 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
     if memory.lost is not None:
         along = memory.lost.towards
         ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
-        return memory.lost._replace(origin=memory.lost.origin + ahead * along)
+        lost = memory.lost._replace(origin=memory.lost.origin + ahead * along)
+        # Without a camera and a place there is no direction to back away from.
+        return lost._replace(approach=0.0) if scene.blinded and not lost.name else lost
     near = [leader] if leader else [n for n in flock.values() if n.member.role != AVOID]
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
     if not near:  # the odometry jumped: the neighbor is at the near edge of the band, or farther

@@ -91,8 +91,12 @@ class Altitude(NamedTuple):
         if self.ground is None:
             return self._replace(limits=limits, highest=self.lowest + max(limits[1], 0.0))
         (low, high), (least, most) = _within_limits(self.ground, params), self.limits
-        return self._replace(limits=limits, lowest=self.lowest if limits[0] == least else low,
-                             highest=self.highest if limits[1] == most else high)
+        # A looser bound never moves a vehicle that began beyond it.
+        lowest = low if limits[0] > least else min(low, self.lowest)
+        highest = high if limits[1] < most else max(high, self.highest)
+        if lowest > highest:  # their margins overlap
+            lowest = highest = 0.5 * (lowest + highest)
+        return self._replace(limits=limits, lowest=lowest, highest=highest)
 
     def follow(self, leader: Neighbor | None, params: PlannerParams,
                elapsed: float) -> Altitude:

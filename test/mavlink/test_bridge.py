@@ -15,6 +15,7 @@
 """The bridge without ROS, flying the embedded autopilot in simulated time: cycle and end."""
 
 from bridge_flight import BOTH, EAST, Flight
+from faulty_autopilot import Fault
 import pytest
 
 pytestmark = pytest.mark.slow
@@ -67,6 +68,19 @@ def test_pilot_in_control_is_left_alone_at_end_of_bridge(personality):
     flight.wire.written = []
     flight.bridge.finish(flight.now)
     assert flight.bridge.has_stopped(flight.now) and flight.wire.written == []
+
+
+@BOTH
+@pytest.mark.parametrize(('silence', 'requests'), [(1.2, True), (3.2, False)])
+def test_end_of_bridge_requests_hold_while_the_mode_is_known(personality, silence, requests):
+    flight = Flight(personality, faults=[Fault('drop', 5.0, 30.0, 'sent')]).follow(1.0)
+    assert flight.now < 5.0
+    flight.fly(5.0 + silence - flight.now)
+    assert flight.bridge.gate.flies
+    flight.wire.written = []
+    flight.bridge.finish(flight.now)
+    kinds = [flight.codec.parse_buffer(written)[0].get_type() for written in flight.wire.written]
+    assert ('COMMAND_LONG' in kinds or 'SET_MODE' in kinds) == requests
 
 
 @BOTH

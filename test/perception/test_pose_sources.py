@@ -259,6 +259,16 @@ def test_frame_with_two_meanings_is_not_guessed(frames: tuple[str, str], known: 
     assert known or (refused and refused[0] == pose_sources.UNKNOWN_FRAME)
 
 
+def test_without_odometry_the_frame_of_the_camera_is_that_of_all() -> None:
+    perceiver = Perceiver(Tracker(config(), MOUNTING, alone=True), max_wait=0.35)
+    perceiver.sources.frames['camera'] = Transform()
+    for k in range(101):
+        perceiver.take_odometry(from_odometry(odometry(
+            empty, pose(k * 0.01).stamp, 'camera', 'camera', np.zeros(3),
+            np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))))
+    assert perceiver.take_pose('leader', pose(0.5), 0.0) is None
+
+
 def test_poses_of_the_body_need_no_frame_of_odometry() -> None:
     perceiver = started()
     for k in range(101):

@@ -151,6 +151,10 @@ def test_unknown_ground_limits_it_to_its_starting_height() -> None:
 @pytest.mark.parametrize(('ground', 'begun', 'changes', 'lowest', 'highest'), [
     (0.5, 4.0, {'altitude_max': 3.0}, 1.6, 3.4), (0.5, 4.0, {'altitude_min': 5.0}, 5.6, 100.4),
     (0.5, 1.0, {'altitude_max': 3.0}, 1.0, 3.4),  # it began below altitude_min
+    # A looser bound does not move it.
+    (0.5, 1.0, {'altitude_min': 0.8}, 1.0, 100.4),
+    (0.5, 200.0, {'altitude_max': 150.0}, 1.6, 200.0),
+    (0.5, 4.0, {'altitude_min': 2.0, 'altitude_max': 2.0}, 2.5, 2.5),  # the margins overlap
     (None, 4.0, {'altitude_max': 3.0}, 4.0, 7.0), (None, 4.0, {'altitude_min': 2.0}, 4.0, 104.0)])
 def test_bounds_that_change_in_flight_count_at_once(
         ground: float | None, begun: float, changes: dict[str, float], lowest: float,

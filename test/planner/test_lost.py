@@ -162,6 +162,20 @@ def test_unknown_place_after_odometry_jump_soon_stops_it(speed: float, coming: f
     assert lost_then is not None and lost_then.approach == pytest.approx(coming, abs=0.01)
 
 
+def test_without_images_it_does_not_retreat_from_an_unknown_place() -> None:
+    params = PlannerParams(v_max=2.0)
+    follower = Follower(params, params.response_time)
+    for _ in range(10):
+        ahead = follower.position + AHEAD
+        follower.tick(seen(follower.now, ahead, (-0.5, 0.0, 0.0)), looked=follower.now)
+    follower.jumped, begin = np.array([0.0, 5.0, 0.0]), follower.position
+    follower.tick(looked=follower.now)
+    blind_from = follower.now
+    for _ in range(60):
+        assert follower.tick(looked=blind_from).state in (State.COAST, State.HOLD)
+    assert math.dist(begin, follower.position) < 0.5
+
+
 def test_after_odometry_jump_it_looks_to_both_sides() -> None:
     follower = Follower()
     for _ in range(5):
