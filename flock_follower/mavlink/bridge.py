@@ -31,7 +31,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.bridge_state import LOST, NO_AUTOPILOT
 from flock_follower.gate.flight_end import EndParams, FlightEnd, Handover, HOLD
 from flock_follower.gate.gate import Gate
-from flock_follower.gate.permission import Cause, MODE_TIMEOUT, Phase, STICK, Taker, UNKNOWN
+from flock_follower.gate.permission import Cause, Phase, STICK, Taker, UNKNOWN
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
 from flock_follower.gate.situation import AcceptedCommand
 from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
@@ -360,9 +360,9 @@ class Bridge:
         setpoint, because autopilots obey it for up to seconds: after that time a braking one would
         make the vehicle fly backwards.
         """
-        # While the mode is unknown the pilot may have taken over.
+        # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (
-                self.telemetry.mode_age(now) <= MODE_TIMEOUT):
+                self.status(now) is not None):
             make = commands.land if self.requests.landing else commands.hold
             goal = make(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)

@@ -71,7 +71,7 @@ def test_pilot_in_control_is_left_alone_at_end_of_bridge(personality):
 
 
 @BOTH
-@pytest.mark.parametrize(('silence', 'requests'), [(1.2, True), (3.2, False)])
+@pytest.mark.parametrize(('silence', 'requests'), [(0.8, True), (1.2, False)])
 def test_end_of_bridge_requests_hold_while_the_mode_is_known(personality, silence, requests):
     flight = Flight(personality, faults=[Fault('drop', 5.0, 30.0, 'sent')]).follow(1.0)
     assert flight.now < 5.0

@@ -162,7 +162,7 @@ def test_unknown_place_after_odometry_jump_soon_stops_it(speed: float, coming: f
     assert lost_then is not None and lost_then.approach == pytest.approx(coming, abs=0.01)
 
 
-def test_without_images_it_does_not_retreat_from_an_unknown_place() -> None:
+def test_without_images_it_retreats_from_no_unknown_place() -> None:
     params = PlannerParams(v_max=2.0)
     follower = Follower(params, params.response_time)
     for _ in range(10):
