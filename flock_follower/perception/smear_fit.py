@@ -82,7 +82,7 @@ _SAME_SLOPES_TURN = 0.06
 #: The same for a step of the pose, cells.
 _SAME_SLOPES_SHIFT = 0.2
 #: The same for a step of the smear, cells: the print is not rendered again with the smear found.
-_SAME_SLOPES_SMEAR = 0.05
+_SAME_SLOPES_SMEAR = 0.02
 #: With the slopes of the step before, and from the smear of another fit, whose first step is not
 #: halved, the last step must be this many times shorter.
 _CLOSER = 2.0
