@@ -46,7 +46,7 @@ from flock_follower.checks.processor import (
     longest_wait,
     ran_for,
     stopped,
-    threads_of,
+    waits_of,
 )
 from flock_follower.fast_dds import profile_variables
 from flock_follower.signals import ending
@@ -327,7 +327,7 @@ class Processes:
 
 def _stop(child: subprocess.Popen[bytes], timeout: float) -> int | None:
     """Send SIGINT to a child that runs, wait, and return its exit code as ``Processes.stop``."""
-    before, begin = threads_of(child.pid), time.monotonic()
+    before, begin = waits_of(child.pid), time.monotonic()
     took = waited = 0.0
     child.send_signal(signal.SIGINT)
     while child.poll() is None:
@@ -335,7 +335,7 @@ def _stop(child: subprocess.Popen[bytes], timeout: float) -> int | None:
             child.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(0.05)
-        waited = max(waited, longest_wait(before, threads_of(child.pid)))
+        waited = max(waited, longest_wait(before, waits_of(child.pid)))
         took = time.monotonic() - begin
     # A node that does not end in time is ended by an alarm of its own.
     if child.returncode in (-signal.SIGKILL, -signal.SIGALRM) and waited > 0.5 * took:

@@ -43,12 +43,12 @@ _TICK: Final = 1.0 / os.sysconf('SC_CLK_TCK')  # s
 
 
 class Counters(NamedTuple):
-    """Readings at one time, s: ns run and waited of each thread, by its file; others in s."""
+    """Readings at one time, s: ns waited of each thread, by its file; others in s."""
 
     time: float
-    threads: Mapping[Path, tuple[int, int]]
+    waited: Mapping[Path, int]
     ran: Mapping[int, float]
-    """Processor time of each process, s, with that of its ended threads."""
+    """Processor time of each process that has not ended, s, with that of its ended threads."""
     ended: float
     """Processor time of all children that have ended, s."""
     machine: float
@@ -77,23 +77,26 @@ class Load(NamedTuple):
                 'processors)')
 
 
-def threads_of(process: int, proc: Path = PROC) -> dict[Path, tuple[int, int]]:
-    """Return ns run and ns waited of each thread; empty if the process has ended."""
+def waits_of(process: int, proc: Path = PROC) -> dict[Path, int]:
+    """Return ns waited of each thread; empty if the process has ended."""
     found = {}
     for path in proc.glob(f'{process}/task/*/schedstat'):
         with contextlib.suppress(OSError, ValueError, IndexError):  # it has ended meanwhile
-            ran, waited = path.read_text(encoding='ascii').split()[:2]
-            found[path] = int(ran), int(waited)
+            found[path] = int(path.read_text(encoding='ascii').split()[1])
     return found
+
+
+def _status_of(process: int, proc: Path) -> list[str]:
+    """Return the fields of ``stat`` after the name, the state first; none without a process."""
+    with contextlib.suppress(OSError):
+        stat = (proc / str(process) / 'stat').read_text(encoding='utf-8', errors='replace')
+        return stat.rpartition(')')[2].split()  # the name may hold anything
+    return []
 
 
 def ran_for(process: int, proc: Path = PROC) -> float:
     """Return the processor time of a process, s; 0 if it has ended."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        stat = (proc / str(process) / 'stat').read_text(encoding='utf-8', errors='replace')
-        # The name, which may hold anything, ends with the last parenthesis.
-        return _TICK * sum(map(int, stat.rpartition(')')[2].split()[11:13]))
-    return 0.0
+    return _TICK * sum(map(int, _status_of(process, proc)[11:13]))
 
 
 def ended_children_ran_for() -> float:
@@ -113,17 +116,17 @@ def children(process: int, proc: Path = PROC) -> list[int]:
 
 def stopped(process: int, proc: Path = PROC) -> bool:
     """Return whether a process was stopped by a signal or a debugger; no load explains that."""
-    with contextlib.suppress(OSError, IndexError):
-        stat = (proc / str(process) / 'stat').read_text(encoding='utf-8', errors='replace')
-        return stat.rpartition(')')[2].split()[0] in ('T', 't')
-    return False
+    return _status_of(process, proc)[:1] in (['T'], ['t'])
 
 
-def longest_wait(before: Mapping[Path, tuple[int, int]],
-                 after: Mapping[Path, tuple[int, int]]) -> float:
+def longest_wait(before: Mapping[Path, int], after: Mapping[Path, int]) -> float:
     """Return the longest time, s, that a thread waited between two readings."""
-    return 1e-9 * max((counted[1] - before.get(path, (0, 0))[1]
-                       for path, counted in after.items()), default=0)
+    return max(_waits(before, after), default=0.0)
+
+
+def _waits(before: Mapping[Path, int], after: Mapping[Path, int]) -> list[float]:
+    """Return the time, s, that each thread waited between two readings."""
+    return [1e-9 * (waited - before.get(path, 0)) for path, waited in after.items()]
 
 
 def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
@@ -135,8 +138,8 @@ def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
     :param ended: the processor time, s, of all children of this process that have ended.
     """
     processes = list(processes)
-    threads = {path: counted for process in processes
-               for path, counted in threads_of(process, proc).items()}
+    waited = {path: time for process in processes
+              for path, time in waits_of(process, proc).items()}
     names = {f'cpu{number}' for number in (
         os.sched_getaffinity(0) if usable is None else usable)}
     ticks = 0
@@ -148,27 +151,20 @@ def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
                 ticks += sum(map(int, fields[:3])) + sum(map(int, fields[5:8]))
     except (OSError, ValueError):
         return None
-    ran = {process: ran_for(process, proc) for process in processes}
-    return Counters(now, threads, ran, ended, ticks * _TICK) if threads else None
+    ran = {process: time for process in processes if (time := ran_for(process, proc))}
+    return Counters(now, waited, ran, ended, ticks * _TICK) if waited else None
 
 
 def load_between(before: Counters, after: Counters, processors: int) -> Load:
     """Return the load between two readings; a thread that only the second reading has is new."""
-    ran, waited = (1e-9 * sum(counted[k] - before.threads.get(path, (0, 0))[k]
-                              for path, counted in after.threads.items()) for k in (0, 1))
-    used = max(after.machine - before.machine, 0.0)
-    ours = _ours(before, after)
-    others = max(used - ours, 0.0)
+    waited = sum(_waits(before.waited, after.waited))
+    ran = sum(ran - before.ran.get(process, 0.0) for process, ran in after.ran.items())
+    gone = sum(ran for process, ran in before.ran.items() if process not in after.ran)
+    # A process that is not our child and has ended counts as another program.
+    ours = ran + max(after.ended - before.ended - gone, 0.0)
+    others = max(after.machine - before.machine - ours, 0.0)
     share = waited / (ran + waited) * others / (others + ours) if waited > 0.0 else 0.0
     return Load(share, others / max(after.time - before.time, 1e-9), processors)
-
-
-def _ours(before: Counters, after: Counters) -> float:
-    """Return the processor time, s, of our processes between two readings, ended ones included."""
-    running = sum(ran - before.ran.get(process, 0.0) for process, ran in after.ran.items())
-    gone = sum(ran for process, ran in before.ran.items() if process not in after.ran)
-    # Who is not our child and has ended counts as another program.
-    return running + max(after.ended - before.ended - gone, 0.0)
 
 
 class LoadMeter:

@@ -29,7 +29,7 @@ from flock_follower.checks.processor import (
     longest_wait,
     read_counters,
     stopped,
-    threads_of,
+    waits_of,
 )
 
 TICK = 0.01  # s of /proc/stat
@@ -154,33 +154,24 @@ def test_new_thread_counts_from_start_and_ended_one_no_more(kernel: Kernel) -> N
     assert worst is not None and worst.share == pytest.approx(0.5 * 0.75, abs=0.01)
 
 
-@pytest.mark.parametrize('before', [0.0, 0.5], ids=['started in the window', 'ran before'])
-def test_a_child_that_ends_is_no_other_program(kernel: Kernel, before: float) -> None:
+@pytest.mark.parametrize(('before', 'others', 'expected'), [
+    (False, (0.0, 0.0), (0.0, 0.0, 2)), (True, (0.0, 0.0), (0.0, 0.0, 2)),
+    # They run for 0.75 of 2 processors and wait for half their time; the others use 1.25.
+    (True, (1.0, 1.5), (0.5 * 1.25 / 2.0, 1.25, 2))],
+    ids=['started in the window', 'ran before', 'beside another program'])
+def test_a_child_that_ends_is_no_other_program(
+        kernel: Kernel, before: bool, others: tuple[float, float],
+        expected: tuple[float, float, int]) -> None:
     meter = LoadMeter(lambda: [7, 8], kernel.proc, (0, 1), lambda: kernel.ended)
-    if before:
-        kernel.run(before, 0.0, p7_1=(0.5, 0.5), p8_1=(1.0, 0.0))
-    else:
-        kernel.run(0.5, 0.0, p7_1=(0.5, 0.5))
+    child = {'p8_1': (0.5, 0.0)}
+    kernel.run(1.0, 0.0, p7_1=(0.5, 0.5), **(child if before else {}))
     meter.sample(kernel.time)
-    kernel.run(1.0, 0.0, p7_1=(0.5, 0.5), p8_1=(1.0, 0.0))
+    kernel.run(1.0, others[0], p7_1=(0.5, 0.5), **child)
     kernel.end(8)
-    kernel.run(1.0, 0.0, p7_1=(0.5, 0.5))
+    kernel.run(1.0, others[1], p7_1=(0.5, 0.5))
     meter.sample(kernel.time)
     worst = meter.worst()
-    assert worst == pytest.approx((0.0, 0.0, 2), abs=0.01)
-
-
-def test_another_program_counts_beside_a_child_that_ends(kernel: Kernel) -> None:
-    meter = LoadMeter(lambda: [7, 8], kernel.proc, (0, 1), lambda: kernel.ended)
-    kernel.run(1.0, 0.0, p7_1=(0.5, 0.0), p8_1=(0.5, 0.0))
-    meter.sample(kernel.time)
-    kernel.run(1.0, 1.0, p7_1=(0.5, 0.5), p8_1=(0.5, 0.0))
-    kernel.end(8)
-    kernel.run(1.0, 1.5, p7_1=(0.5, 0.5))
-    meter.sample(kernel.time)
-    worst = meter.worst()
-    # They run for 0.75 of 2 processors and wait for 0.5; the others use 1.25.
-    assert worst == pytest.approx((0.5 * 1.25 / 2.0, 1.25, 2), abs=0.01)
+    assert worst == pytest.approx(expected, abs=0.01)
 
 
 def test_without_the_kernels_counters_the_load_is_unknown(tmp_path: Path, kernel: Kernel) -> None:
@@ -197,9 +188,9 @@ def test_without_the_kernels_counters_the_load_is_unknown(tmp_path: Path, kernel
 
 def test_the_longest_wait_is_that_of_one_thread(kernel: Kernel) -> None:
     kernel.run(1.0, 0.0, p7_1=(0.0, 0.5))
-    before = threads_of(7, kernel.proc)
+    before = waits_of(7, kernel.proc)
     kernel.run(1.0, 0.0, p7_1=(0.0, 0.25), p7_2=(0.0, 0.75))
-    assert longest_wait(before, threads_of(7, kernel.proc)) == pytest.approx(0.75)
+    assert longest_wait(before, waits_of(7, kernel.proc)) == pytest.approx(0.75)
     assert longest_wait(before, {}) == 0.0
 
 
