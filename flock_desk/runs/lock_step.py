@@ -41,7 +41,7 @@ from flock_follower.messages import (
     TRAJECTORY,
 )
 
-DURATION = 2.5  # s in offboard mode
+OFFBOARD_TIME = 2.5  # s in offboard mode
 #: The leader leaves at once, faster than the default v_max: all commands point one way.
 LEAVING = LeaderMotion(wait=0.0, acceleration=2.0, jerk=10.0, legs=(
     Leg(duration=60.0, velocity=(1.0, 0.0, 0.0)),))
@@ -73,7 +73,7 @@ class SignFlight(DetectorFlight):
 
     def shares(self) -> dict[str, float | None]:
         """Fly, and return the figures of ``SIGNS``; None if nothing could be judged."""
-        self.fly(DURATION)
+        self.fly(OFFBOARD_TIME)
         directions = (along_law([message for _, message in self._commands], self._neighbors,
                                 self._own, self._law),
                       opposed(self._vehicle.log.arrays(), self._commands))

@@ -64,7 +64,7 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
     :param max_wait: the longest time for which a pose waits for odometry of its stamp, s.
     """
     perceiver = Perceiver(Tracker(config, Transform()), max_wait=max_wait)
-    perceiver.sources.frames.update({name.lstrip('/'): T for name, T in cameras.items()})
+    perceiver.sources.place_cameras(cameras.items())
     perceiver.sources.static = static
     seen = {n.name: SourceSeen(n.source.topic) for n in config.neighbors if n.source is not None}
     frames = dict.fromkeys(seen, '')

@@ -26,7 +26,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.bridge_state import LOST, NO_AUTOPILOT
 from flock_follower.gate.flight_end import EndParams, FlightEnd, Handover, HOLD
@@ -294,15 +293,13 @@ class Bridge:
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
         """Set height 0: the place of arming, or home if the arming was not observed."""
-        heights, flying = self.gate.heights, self.telemetry.is_flying(now)
+        heights, left = self.gate.heights, self.telemetry.has_left_ground(now)
         armed_now, self._armed = status.armed and self._armed is False, status.armed
-        if flying is False and self.telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
-            flying = True  # it has left the place of arming
         if not status.armed:
             heights.refer(None, now)
-        elif armed_now or (not heights.has_reference and flying is False):
+        elif armed_now or (not heights.has_reference and left is False):
             heights.refer(0.0, now)
-        elif not heights.has_reference and flying and (
+        elif not heights.has_reference and left and (
                 (above := self.telemetry.height_above_home(now)) is not None):
             heights.refer(above, now)
 

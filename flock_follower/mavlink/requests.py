@@ -25,8 +25,6 @@ from collections.abc import Callable
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import all as mavlink
-
 from flock_follower.gate import envelope
 from flock_follower.gate.flight_end import FlightEnd, Handover, NO_HANDOVER
 from flock_follower.gate.gate import Gate
@@ -235,10 +233,10 @@ class Requests:
         if not status.armed:
             return 'disarmed: arm first'
         # A second climb would begin at the height that the first has reached by now.
-        flying = telemetry.is_flying(now)
-        if flying is None:
+        left = telemetry.has_left_ground(now)
+        if left is None:
             return UNKNOWN_IF_FLYING
-        if flying or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
+        if left:
             return 'already in the air'
         if telemetry.altitude(now) is None:
             return 'no LOCAL_POSITION_NED: the height reached would be unknown'

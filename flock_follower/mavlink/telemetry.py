@@ -222,6 +222,12 @@ class Telemetry:
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
         return None if message is None else _FLYING.get(message.landed_state)
 
+    def has_left_ground(self, now: float) -> bool | None:
+        """Return whether the vehicle flies or is taking off; None without a report."""
+        flying = self.is_flying(now)
+        return flying if flying is None else (
+            flying or self.landed == mavlink.MAV_LANDED_STATE_TAKEOFF)
+
     @property
     def vehicle_type(self) -> int | None:
         """Return the MAV_TYPE in the newest HEARTBEAT, None before the first."""

@@ -140,7 +140,7 @@ class Perceiver:
         if known.frame != message.header.frame_id:
             known.frame = message.header.frame_id
             self.sources.place_cameras(
-                (each.frame.lstrip('/'), self.tracker.cameras[name].T_body_camera)
+                (each.frame, self.tracker.cameras[name].T_body_camera)
                 for name, each in self._cameras.items())
         if calibration == known.calibration:
             return False

@@ -162,17 +162,16 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
 
     :param last: the last measurement, if the print was smeared in it.
     """
-    smeared = last is not None
+    smeared, starts = last is not None, list[tuple[int, SmearStart]]()
     whole = None if last is None else _fit_as_before(image, camera, sought, pose, last)
+    if whole is None:
+        starts = _smear_starts(image, camera, sought, pose, smeared)
+        if smeared:
+            whole = _fit_whole(image, camera, sought, starts)
+        elif not starts:
+            return None, None
     if whole is not None and whole.fit.blur > EDGELESS:
         return None, whole
-    starts = [] if whole is not None else _smear_starts(image, camera, sought, pose, smeared)
-    if whole is None and not starts and not smeared:
-        return None, None
-    if smeared and whole is None:
-        whole = _fit_whole(image, camera, sought, starts)
-        if whole is not None and whole.fit.blur > EDGELESS:
-            return None, whole
     place = starts[0][1].pose if starts else pose
     found, sharp = _fit_shown(image, camera, sought.model,
                               place if whole is None else whole.fit.pose, None)
@@ -189,7 +188,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
     """Return the measurement of a fit to edges, also of the mirrored attitude if necessary."""
     if not check_mirrored:
         return _measurement(sought, found, None)
-    chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
+    chosen = _hypothesis_of(found)
     if len(found.lines.model.codes) > 1:
         return _measurement(sought, found, Choice(chosen, math.inf))
     best = choose([chosen, *_mirrored_hypotheses(camera, found)], expected)
@@ -208,10 +207,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
     :param smeared: whether its whole print is fitted if its edges are smeared.
     """
-    marker = sought.neighbor.markers[index]
-    T_marker_body = marker.T_body_marker.inverse()
-    starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
-    alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
+    alone, starts = _starts_of(camera, sought, index, corners)
     near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
     fits = [one for one in near
             if one.inlier_share > FOUND_INLIER_SHARE and _find_shown(image, one).all()]
@@ -228,6 +224,19 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     return _measurement(sought, found, best)
 
 
+def _starts_of(camera: CameraModel, sought: Target, index: int,
+               corners: Array) -> tuple[EdgeModel, list[Transform]]:
+    """Return the edges of a detected marker alone, and both poses of its neighbor."""
+    marker = sought.neighbor.markers[index]
+    T_marker_body = marker.T_body_marker.inverse()
+    return sought.model.only(np.arange(len(sought.model.codes)) == index), [
+        pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
+
+
+def _hypothesis_of(found: EdgeFit) -> Hypothesis:
+    return Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
+
+
 def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
                 pose: Transform, up: Array | None) -> bool:
     """
@@ -236,14 +245,12 @@ def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: in
     It costs half of :func:`locate`, which then says which one: one attitude is fitted, and the
     mirrored one to the edges found so.
     """
-    marker = sought.neighbor.markers[index]
-    T_marker_body = marker.T_body_marker.inverse()
-    alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
-    for start in ippe(corners, camera, marker.side_length):
-        found = fit(image, camera, alone, start @ T_marker_body)
+    alone, starts = _starts_of(camera, sought, index, corners)
+    for start in starts:
+        found = fit(image, camera, alone, start)
         if found is not None and found.inlier_share > FOUND_INLIER_SHARE:
-            chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found))
-            best = choose([chosen, *_mirrored_hypotheses(camera, found)], PosePrior(None, up))
+            best = choose([_hypothesis_of(found), *_mirrored_hypotheses(camera, found)],
+                          PosePrior(None, up))
             return angle(best.chosen.pose, pose) > MAX_TURN
     return False
 

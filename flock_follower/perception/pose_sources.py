@@ -51,7 +51,7 @@ OLDEST_POSE = 1.0
 SAME_IMAGE = 1e-3
 MOST_WAITING = 100  # poses, and frames: a bound on memory
 #: m: a body that is nearer to the own frame is none: some detectors send zeros if they find none.
-NEAREST = 0.05
+NEAREST_POSE = 0.05
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
 AXES_VARIANCE = 1e-4
 BASE = 'base_link'
@@ -119,7 +119,7 @@ class PoseSources:
 
     def place_cameras(self, placed: Iterable[tuple[str, Transform]]) -> None:
         """Take frame and pose on the body of each camera; a frame of two cameras is of neither."""
-        placed = [each for each in placed if each[0]]
+        placed = [(stripped, pose) for name, pose in placed if (stripped := name.lstrip('/'))]
         names = [name for name, _ in placed]
         self.frames = {name: pose for name, pose in placed if names.count(name) == 1}
 
@@ -160,7 +160,7 @@ class PoseSources:
             return UNKNOWN_FRAME, (
                 f'{name}: frame {frame!r}: must be {expected}, {BASE}, a frame connected to it by '
                 f'tf_static, or of a camera: {", ".join(self.frames) or "no camera_info yet"}')
-        nearest, farthest = (0.0, SANE) if T_body_frame is None else (NEAREST, FARTHEST)
+        nearest, farthest = (0.0, SANE) if T_body_frame is None else (NEAREST_POSE, FARTHEST)
         if not nearest <= math.hypot(*state.position.tolist()) <= farthest:  # NaN fails
             return INVALID, f'{name}: position {state.position.tolist()}'
         checked = _attitude(source, state)

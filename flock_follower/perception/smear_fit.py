@@ -85,7 +85,7 @@ _SAME_SLOPES_SHIFT = 0.2
 _SAME_SLOPES_SMEAR = 0.02
 #: With the slopes of the step before, and from the smear of another fit, whose first step is not
 #: halved, the last step must be this many times shorter.
-_CLOSER = 2.0
+_CLOSER_FACTOR = 2.0
 #: A step that turns by less, rad, may be the last.
 _LAST_TURN = 0.02
 #: A step of pose and smear that is shorter, cells, may be the last.
@@ -316,8 +316,8 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
             return None
         response = step[6:9].tolist()
         turn, offset = max(map(abs, step[3:6].tolist())), max(map(abs, step[:3].tolist()))
-        smeared = max(map(abs, (linearized_at + step[-2:] - smear).tolist()))
-        smear = linearized_at + step[-2:]
+        smear, last = linearized_at + step[-2:], smear
+        smeared = max(map(abs, (smear - last).tolist()))
         if (not max(turn, smeared) < _MAX_TURN or response[0] <= 0.0
                 or offset > _MAX_STEP_SHARE * at.center[2]
                 or math.hypot(*smear.tolist()) > _MAX_SMEAR):
@@ -325,7 +325,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
         pose = moved(pose, at.center, step)
         residual = at.brightness - step.dot(at.design)
         shift = max(offset / model.cell, smeared)
-        factor = 1.0 if fresh and not known else _CLOSER
+        factor = 1.0 if fresh and not known else _CLOSER_FACTOR
         if count >= first and factor * turn < _LAST_TURN and factor * shift < _LAST_SHIFT:
             break
         squares = residual * residual

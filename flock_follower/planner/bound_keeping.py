@@ -40,8 +40,10 @@ from flock_follower.planner.vectors import scalar_product
 
 # Reasons of bounds.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
-INSISTENCE = 10.0  # of cohesion beyond ``v_max``: see ``keep_bounds``
-STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
+#: Factor by which the correction for cohesion beyond ``v_max`` counts: see ``keep_bounds``.
+COHESION_INSISTENCE = 10.0
+#: Horizontal share of a bound's normal, below which no horizontal command helps.
+MIN_HORIZONTAL_SHARE = 0.1
 
 
 class Bound(NamedTuple):
@@ -101,8 +103,8 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
 
     If the bounds leave no room they are met one after the other in their order, each as nearly as
     those before it allow. Cohesion beyond ``v_max`` is met less: only as nearly as by the velocity
-    nearest to ``INSISTENCE`` times the correction. Met to the last bit, it would take all speed
-    across for very little, and the command would switch from tick to tick.
+    nearest to ``COHESION_INSISTENCE`` times the correction. Met to the last bit, it would take all
+    speed across for very little, and the command would switch from tick to tick.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
@@ -120,7 +122,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     # The bounds on which the horizontal part has an influence.
     sides = [(complex(x, y), each.least - z * requested[2], each.reason)
              for each in required for x, y, z in [each.normal]
-             if math.hypot(x, y) > STEEP]
+             if math.hypot(x, y) > MIN_HORIZONTAL_SHARE]
     bounds = [side[:2] for side in sides]
     missed = [product(normal, complex(*requested[:2])) < least for normal, least in bounds]
     if not any(missed):
@@ -132,7 +134,8 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     goal = complex(*limit_norm(a, SANE)[:2])
     for k, (normal, least) in enumerate(bounds):
         if missed[k] and sides[k][2] == COHESION:
-            step = min(INSISTENCE * (least - product(normal, goal)), SANE) / abs(normal) ** 2
+            correction = COHESION_INSISTENCE * (least - product(normal, goal))
+            step = min(correction, SANE) / abs(normal) ** 2
             reached = Discs(*within, *within).best(goal + step * normal)
             bounds[k] = normal, min(least, product(normal, reached))
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)

@@ -175,18 +175,26 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
     me, leader = scene.me, scene.leader
     if (scene.state is State.TRACK and leader is None) or memory.followed is None:
         return None
-    if memory.lost is not None:
+    if memory.lost is None:
+        lost = _new_loss(memory, flock, scene, params)
+    else:
         along = memory.lost.towards
         ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
         lost = memory.lost._replace(origin=memory.lost.origin + ahead * along)
-        # Without a camera and a place there is no direction to back away from.
-        return lost._replace(approach=0.0) if scene.blinded and not lost.name else lost
+    # Without a camera and a place there is no direction to back away from.
+    return lost._replace(approach=0.0) if scene.blinded and not lost.name else lost
+
+
+def _new_loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
+              params: PlannerParams) -> Loss:
+    """Return the loss of the neighbor that was followed in the last tick."""
+    me, leader = scene.me, scene.leader
     near = [leader] if leader else [n for n in flock.values() if n.member.role != AVOID]
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
     if not near:  # the odometry jumped: the neighbor is at the near edge of the band, or farther
         free = float(towards @ me.position) + math.sqrt(params.law.d0)
-        coming = 0.0 if scene.blinded else memory.coming
-        return Loss(towards, me.position, free, coming, float(me.position[2]), np.zeros(3), '')
+        return Loss(towards, me.position, free, memory.coming, float(me.position[2]),
+                    np.zeros(3), '')
     n = min(near, key=lambda n: (math.dist(n.position, me.position), n.name))
     x, y, _ = expected_now(n, memory, me.stamp, params).position - me.position
     if math.hypot(x, y) > OVERHEAD_DISTANCE:
