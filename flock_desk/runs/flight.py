@@ -38,6 +38,7 @@ from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
+    SIH_TRUTH_PORT,
     wait_until,
 )
 from flock_desk.scenarios.scenario import Scenario
@@ -48,7 +49,6 @@ from flock_follower.mavlink.transport import open_transport
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray',
             'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory']
-SIH_TRUTH = 'udpin:127.0.0.1:19410'  # where PX4's SIH sends the truth
 ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
 START_TIMEOUT = 40.0  # s for all processes to be there: a busy machine takes its time
 READY_TIMEOUT = 90.0  # s for an external estimator, without which the autopilot does not arm
@@ -61,6 +61,7 @@ MARGIN = 1.5  # s beyond the duration: the simulator receives the engagement a l
 GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
 COUNTER_PERIOD = 1.2  # s in which every node publishes its counters once more
+SIH_TRUTH = f'udpin:127.0.0.1:{SIH_TRUTH_PORT}'  # where PX4's SIH sends the truth
 VIEW = 'view'
 DETECTED = 'DICT_APRILTAG_36h11'  # of the leader's marker, for another detector
 T = TypeVar('T')
@@ -91,17 +92,21 @@ class Flown(NamedTuple):
 
 def links(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') -> External:
     """
-    Return the links to an autopilot; without a truth the usual one.
+    Return the links to an autopilot; without a truth ``usual_truth``.
 
     :raises ValueError: for a URL that is invalid. :raises OSError: if it cannot be opened.
     """
-    if not truth:
-        tcp = re.fullmatch(r'(tcp:.*:)(\d+)', autopilot)
-        truth = f'{tcp[1]}{int(tcp[2]) + 2}' if tcp else SIH_TRUTH
+    truth = truth or usual_truth(autopilot)
     with contextlib.ExitStack() as opened:  # all at once: none may have the port of another
         for url in filter(None, (autopilot, truth, leader)):
             opened.callback(open_transport(url).close)
     return External(autopilot, truth, forward_odometry, leader)
+
+
+def usual_truth(autopilot: str) -> str:
+    """Return the link on which a simulator tells the truth by default: ArduPilot's, else SIH's."""
+    tcp = re.fullmatch(r'(tcp:.*:)(\d+)', autopilot)
+    return f'{tcp[1]}{int(tcp[2]) + 2}' if tcp else SIH_TRUTH
 
 
 def namespaces(followers: int) -> list[str]:

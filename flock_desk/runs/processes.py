@@ -48,12 +48,17 @@ from flock_follower.checks.processor import (
     stopped,
     waits_of,
 )
+from flock_follower.checks.reach import PORTS_FROM, PORTS_PER_DOMAIN
 from flock_follower.fast_dds import profile_variables
 from flock_follower.signals import ending
 
 TOO_BUSY_EXIT_CODE = 3
 LONGEST_STOP = 60.0  # s until a process is killed, however long it waits for a processor
 PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
+#: Where PX4's SIH sends the truth: on the domain of this port the first node would take it.
+SIH_TRUTH_PORT = 19_410
+#: Valid on every platform, without the one that has this port.
+DOMAINS = [i for i in range(1, 101) if i != (SIH_TRUTH_PORT - PORTS_FROM) // PORTS_PER_DOMAIN]
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
 SCHEDULER_TIMEOUT = 10.0  # s to find the scheduler of a cluster
 Given = TypeVar('Given')
@@ -67,11 +72,9 @@ def claim_domain() -> int:
     """
     Return a ROS domain id that no other process of this package on this machine uses.
 
-    The id is in 1 to 100, the range that is valid on every platform.
-
-    :raises RuntimeError: if all of them are in use.
+    :raises RuntimeError: if all of ``DOMAINS`` are in use.
     """
-    for domain_id in random.SystemRandom().sample(range(1, 101), 100):
+    for domain_id in random.SystemRandom().sample(DOMAINS, len(DOMAINS)):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         with contextlib.suppress(OSError):
             claim.bind(f'\0flock_follower domain {domain_id}')  # a name without a file

@@ -32,9 +32,10 @@ from flock_desk.runs.flight import (
     parameters_of_nodes,
     spacing,
     start_view,
+    usual_truth,
 )
 from flock_desk.runs.judge import flat, judge
-from flock_desk.runs.processes import LateError, Processes
+from flock_desk.runs.processes import free_udp_port, LateError, Processes
 from flock_desk.runs.record import LiveFlight, read_flown
 from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import Outage, Scenario
@@ -345,14 +346,18 @@ def test_bridge_ends_flight_with_first_state_after_active(states, ended):
         f'[INFO] [17.4] [mavlink_bridge]: state: {state}\n' for state in states)) == ended
 
 
-@pytest.mark.parametrize(('autopilot', 'truth', 'expected'), [
-    ('udp:127.0.0.1:14988', '', ('udp:127.0.0.1:14988', 'udpin:127.0.0.1:19410')),
-    ('udpin:127.0.0.1:14988', 'udp:127.0.0.1:14989',
-     ('udpin:127.0.0.1:14988', 'udp:127.0.0.1:14989')),
-    ('tcp:127.0.0.1:5760', '', ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5762')),
-    ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5763', ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5763'))])
-def test_the_truth_comes_on_the_usual_link_of_each_simulator(autopilot, truth, expected):
-    assert links(autopilot, truth, False)[:2] == expected
+@pytest.mark.parametrize(('autopilot', 'expected'), [
+    ('udp:127.0.0.1:14988', 'udpin:127.0.0.1:19410'),
+    ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5762')])
+def test_the_truth_comes_on_the_usual_link_of_each_simulator(autopilot, expected):
+    assert usual_truth(autopilot) == expected
+
+
+def test_no_two_links_have_one_port():
+    autopilot, truth = (f'udpin:127.0.0.1:{free_udp_port()}' for _ in range(2))
+    assert links(autopilot, truth, False)[:2] == (autopilot, truth)
+    with pytest.raises(OSError, match='in use'):
+        links(autopilot, autopilot, False)
 
 
 def test_estimate_is_refused_as_truth_if_odometry_is_forwarded(tmp_path):

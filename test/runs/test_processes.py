@@ -26,6 +26,7 @@ import pytest
 
 from flock_desk.runs.processes import (
     claim_domain,
+    DOMAINS,
     explained,
     LateError,
     Processes,
@@ -164,4 +165,9 @@ def test_no_two_claims_give_one_domain():
         stdout=subprocess.PIPE, text=True, check=True)
     theirs = set(map(int, other.stdout.split()))
     assert len(ours) == 5 and len(theirs) == 50 and not ours & theirs
-    assert ours | theirs <= set(range(1, 101))
+    assert ours | theirs <= set(DOMAINS) <= set(range(1, 101))
+
+
+def test_no_domain_has_the_port_of_the_truth():
+    """By DDSI-RTPS 9.6.2 the first node on domain 48 listens on 7400 + 250 * 48 + 10 = 19410."""
+    assert 48 not in DOMAINS and len(DOMAINS) == 99
