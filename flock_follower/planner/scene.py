@@ -152,7 +152,8 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
              or (leader is not None and leader.name == name)
              or (silent(n, now, params) and now - n.stamp <= params.resume_timeout)}
     return by_name(flock | {n.name: n for n in memory.neighbors.values()
-                            if state is State.TRACK or n.member.role == AVOID})
+                            if state is State.TRACK or n.member.role == AVOID
+                            or n.name in memory.flock})
 
 
 def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
