@@ -34,7 +34,8 @@ ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 @pytest.mark.ros
 def test_the_parameter_page_is_that_of_the_nodes():
     from flock_desk.program import markdown
-    assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown()
+    assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown(), (
+        'run: python -m flock_desk.program --parameters > config/PARAMETERS.md')
 
 
 FOLDERS = 'benchmarks|config|bags|deploy|docs|examples|launch|test|requirements|flock_follower'
