@@ -367,14 +367,14 @@ class Evaluation(Listener):
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
              namespace: str = '', remaps: Mapping[str, str] | None = None,
-             checked: bool = True) -> Evaluation:
+             with_check: bool = True) -> Evaluation:
     """
     Run a bag through the chain and write the messages that the nodes would have published.
 
     :param values: the parameters of every node, see ``parameters.files.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag; ``remaps``: their names, by ours, if they differ.
-    :param checked: whether the rules of ``check`` judge the bag, too.
+    :param with_check: whether the rules of ``check`` judge the bag, too.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
     :raises OSError: if the result cannot be written.
     """
@@ -392,7 +392,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
                 deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
             system = None
-            if checked:
+            if with_check:
                 evaluation.own = OwnMotion(evaluation.source)
                 system = RecordedSystem(bag, values, '', namespace, remaps, evaluation.own)
             _play(bag, used, evaluation, system, frames)

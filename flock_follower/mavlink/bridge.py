@@ -80,7 +80,7 @@ class Bridge:
 
     :param forwarder: if given, its odometry is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
-    :param require_failsafe: whether offboard requires the ``rules`` of the dialect.
+    :param require_failsafe: whether offboard requires the ``offboard_rules`` of the dialect.
     :param recommendations: this, ``estimate_rate`` and ``origin`` are those of ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
     :param end: conditions under which the bridge itself ends a flight.
@@ -312,7 +312,7 @@ class Bridge:
         end = self.end.reason(
             self.gate.active_since, self.gate.commands.received,
             self.gate.handover(now) if flies else '', now)
-        if moved := self.sticks.moved and self.housekeeping.watches_sticks():
+        if moved := self.sticks.has_moved and self.housekeeping.watches_sticks():
             end = Handover(STICK.text, cause=Cause.STICK)
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:

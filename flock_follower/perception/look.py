@@ -191,8 +191,8 @@ def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeigh
     middle = T_camera_body.apply(reference)
     rows = camera.project(np.concatenate([seen, middle[None]]))[:, 1]
     later = readout_time / camera.height * (rows[:-1] - rows[-1])
-    moved = later[:, None] * (velocity + np.cross(rates, seen - middle))
-    found = refine(camera.project(seen - moved), camera, points, reference, T_camera_body)
+    displacement = later[:, None] * (velocity + np.cross(rates, seen - middle))
+    found = refine(camera.project(seen - displacement), camera, points, reference, T_camera_body)
     return T_camera_body if found is None else found[0]
 
 

@@ -71,7 +71,7 @@ class Estimate(NamedTuple):
     acceleration: Array
     covariance: Array
 
-    def moved(self, stamp: float, linear: Array, transition: Array, noise: Array) -> Estimate:
+    def propagate(self, stamp: float, linear: Array, transition: Array, noise: Array) -> Estimate:
         """Return the state at another stamp, given ``neighbor_motion.transition`` to there."""
         dt = stamp - self.stamp
         return Estimate(

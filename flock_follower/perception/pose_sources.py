@@ -163,16 +163,16 @@ class PoseSources:
         nearest, farthest = (0.0, SANE) if T_body_frame is None else (NEAREST_POSE, FARTHEST)
         if not nearest <= math.hypot(*state.position.tolist()) <= farthest:  # NaN fails
             return INVALID, f'{name}: position {state.position.tolist()}'
-        checked = _attitude(source, state)
-        if isinstance(checked, str):
-            return checked, name
+        attitude = _attitude(source, state)
+        if isinstance(attitude, str):
+            return attitude, name
         covariance = _covariance(source, state)
         if isinstance(covariance, str):
             return covariance, name
         self._newest[name] = stamp
         if len(self._poses) < MOST_WAITING:
             insort(self._poses, _Waiting(
-                stamp, name, state, Transform.from_quaternion(state.position, checked),
+                stamp, name, state, Transform.from_quaternion(state.position, attitude),
                 covariance, T_body_frame, now), key=lambda waiting: waiting.stamp)
         return None
 

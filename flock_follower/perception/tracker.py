@@ -457,7 +457,7 @@ class Tracker:
         name, camera, sighting = measurement.name, look.camera, look.sighting
         outcome, candidate = taken
         other = look.measured.get(name) is not measurement
-        refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)
+        refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.OLDER)
         if not other and (refused or outcome is UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if refused:
@@ -493,9 +493,9 @@ class Tracker:
         if change is not None and estimate is not None:
             camera.noise.take(*change, estimate.position - view.own.travel)
         point = measurement.T_camera_body.apply(measurement.reference)
-        shift = camera.time_offset.take(
+        offset_change = camera.time_offset.take(
             name, placed.exposed, point, camera.T_body_camera, self._odometry)
-        if not shift:
+        if not offset_change:
             return
         camera.noise.restart()
         for other, hypotheses in self._hypotheses.items():
@@ -503,4 +503,4 @@ class Tracker:
                 for each in hypotheses.tracks:
                     if each.newest is not None:
                         sight = each.newest.position - view.own.travel
-                        each.shift(shift * view.moving(sight), shift)
+                        each.add_error(offset_change * view.moving(sight), offset_change)

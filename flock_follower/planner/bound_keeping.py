@@ -38,7 +38,8 @@ from flock_follower.planner.limits import (
 from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, nearest_in_order, product
 from flock_follower.planner.vectors import scalar_product
 
-# Reasons of bounds.
+# Reasons of bounds. Separation and cohesion are the guard's edges of the band; the law's terms of
+# the same names are in ``flocking``.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 #: Factor by which the correction for cohesion beyond ``v_max`` counts: see ``keep_bounds``.
 COHESION_INSISTENCE = 10.0

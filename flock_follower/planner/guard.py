@@ -18,7 +18,7 @@ The guard: the order of all bounds on a command, and the command within them.
 Order of the bounds, most important first: separation from neighbors in sight, the fences,
 separation from neighbors out of sight, sight of the faced neighbor, cohesion. Lower-priority
 bounds never relax higher ones, and none of them relaxes ``a_max`` and ``v_max``. The vertical part
-of a command is bounded beforehand (``climb_range``, ``overflight``).
+of a command is bounded beforehand (``climb_rates``, ``overflight``).
 
 The bounds of one neighbor are those of :mod:`flock_follower.planner.bounds`.
 """
@@ -92,7 +92,7 @@ def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
             *(each for each in reversed(near) if each.reason == COHESION)]
 
 
-def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
+def climb_rates(neighbors: Iterable[Neighbor], me: OwnState,
                 params: PlannerParams) -> tuple[float, float]:
     """
     Return the least and greatest vertical speed, m/s, that neighbors in sight permit.

@@ -118,16 +118,16 @@ def test_two_publishers_are_refused_until_one_is_left(
     r.odom(0.0)
     r.odom(0.1)
     ends['/poses'] *= 2
-    r.node._sources.look()
+    r.node._sources.subscribe_available()
     r.give('poses', pose(0.05))
     assert not r.found and r.counters[TWO_PUBLISHERS] == 1
     assert '2 publishers' in r.problems()
     del ends['/poses'][1]
-    r.node._sources.look()
+    r.node._sources.subscribe_available()
     r.give('poses', pose(0.06))
     assert len(r.found) == 1
     ends['/poses'].clear()  # a publisher that has just begun again is not found yet
-    r.node._sources.look()
+    r.node._sources.subscribe_available()
     r.give('poses', pose(0.07))
     assert len(r.found) == 2 and r.counters[TWO_PUBLISHERS] == 1
 

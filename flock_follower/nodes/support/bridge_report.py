@@ -120,7 +120,7 @@ class BridgeReport:
             self._publish(self._motions, lambda: self._odometry_message(*motion))
         if battery is not None and battery.time == now:
             self._publish(self._battery, lambda: self._battery_message(battery))
-        self._send_arming(now)
+        self._publish_arming_place(now)
 
     def _announce(self, now: float) -> None:
         """Publish the state; log its changes, what ended a flight, and the autopilot's texts."""
@@ -140,7 +140,7 @@ class BridgeReport:
             log = self._warn if text.severity <= WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
-    def _send_arming(self, now: float) -> None:
+    def _publish_arming_place(self, now: float) -> None:
         """Publish the place of arming by the odometry, if there is any."""
         status, place = self._bridge.telemetry.status, self.place
         if status is None or status.armed == self._armed:

@@ -64,7 +64,7 @@ def for_each(messages: Iterable[Any], take: Callable[[Any], None]) -> None:
 class NodeClock(Protocol):
     """A clock of a node that does not jump if the system clock is set: ``EvenClock``."""
 
-    shift: int
+    clock_shift: int
 
     def now(self) -> int:
         """Return the time, ns."""
@@ -137,10 +137,10 @@ class OwnOdometry:
         """Takes the messages that wait, see ``FlockNode.poll``."""
 
     def _take(self, message: Odometry, arrival: int) -> None:
-        child, shift = message.child_frame_id, 0
+        child, clock_shift = message.child_frame_id, 0
         if self._clock is not None:
             self._clock.now()
-            shift = self._clock.shift
+            clock_shift = self._clock.clock_shift
             if not self._clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
                 return
         if self._static and child != self._placed and (
@@ -149,14 +149,14 @@ class OwnOdometry:
             self.source.place_child(pose)
             self._node.get_logger().info(f'{child} is at {pose.translation.round(3).tolist()} m '
                                          f'on {BASE} by tf_static')
-        state = self.source.take(message, arrival - shift, shift)
+        state = self.source.take(message, arrival - clock_shift, clock_shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
         if self.source.twist.found != self._found:
             self._found = self.source.twist.found
             self._node.get_logger().info(f'velocity of odom: {self.source.twist.describe}')
         if state is not None:
-            self._use(state, arrival - shift)
+            self._use(state, arrival - clock_shift)
 
     def _values(self, now: float) -> dict[str, str]:
         source = self.source

@@ -86,8 +86,8 @@ class PoseInputs:
             self._subscribe_transforms(own_frames)
         perceiver.sources.static = StaticChild(node).frames
         node.diagnostics.checks.append(self._problem)
-        node.create_timer(LOOK_PERIOD, self.look, clock=STEADY)
-        self.look()
+        node.create_timer(LOOK_PERIOD, self.subscribe_available, clock=STEADY)
+        self.subscribe_available()
 
     def _subscribe_transforms(self, own_frames: frozenset[str]) -> None:
         if own := own_frames.intersection(self._transforms):
@@ -96,7 +96,7 @@ class PoseInputs:
         self._node.subscribe(message_class(TRANSFORMS), '/tf', self._take_transforms,
                              best_effort(100), required=False, largest=TRANSFORMS_BYTES_MAX)
 
-    def look(self) -> None:
+    def subscribe_available(self) -> None:
         """Subscribe the topics that have a publisher now; count the publishers of each."""
         for topic, name in self._names.items():
             ends = self._node.get_publishers_info_by_topic(topic)
