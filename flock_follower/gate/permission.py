@@ -115,7 +115,7 @@ class Permission:
     cause: Cause | None = Cause.NOT_REQUESTED
     """The same for code; None if it is ACTIVE."""
     taker: Taker = UNKNOWN
-    """While TAKEN_OVER, who has changed the mode; STICK from the stick's move to the next request."""
+    """While TAKEN_OVER, who has changed the mode; after a stick moved, STICK until a request."""
     left_for: str = ''
     """While TAKEN_OVER, the mode that was flown instead."""
 
