@@ -352,16 +352,19 @@ class Bridge:
         """
         Send the final messages.
 
-        A vehicle that still flies our setpoints receives a hold command, or the land command again
-        if a landing is pending; none while its mode is unknown. The last message is a level
-        setpoint, because autopilots obey it for up to seconds: after that time a braking one would
-        make the vehicle fly backwards.
+        A vehicle that still flies our setpoints receives a hold command, or again the one by which
+        a pending request ends the flight: a landing, or the pilot's mode after a stick was moved;
+        none while its mode is unknown. The last message is a level setpoint, because autopilots
+        obey it for up to seconds: after that time a braking one would make the vehicle fly
+        backwards.
         """
         # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (
                 self.status(now) is not None):
-            make = commands.land if self.requests.landing else commands.hold
-            goal = make(self.telemetry.dialect)
+            pending = self.requests.pending
+            ends = pending is not None and pending.goal.ends_flight and pending.current.modes
+            goal = pending.current if pending is not None and ends else (
+                commands.hold(self.telemetry.dialect))
             self.link.send_command(goal.command, goal.params)
         setpoint, _ = self._decide(now)
         if setpoint.kind != NONE:

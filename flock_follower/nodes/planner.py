@@ -193,9 +193,10 @@ class Planner(FlockNode):
             self._loop.take_camera_info(message, values.rpy, camera, values.rectified)
 
     def _take_armed_at(self, message: PointStamped) -> None:
-        if math.isfinite(message.point.z):
-            self._loop.ground = message.point.z
-            self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
+        known = math.isfinite(message.point.z)
+        self._loop.ground = message.point.z if known else None
+        self.get_logger().info(f'armed at a height of {message.point.z:.2f} m' if known else (
+            'the height at arming is unknown'))
 
     def _take_frame(self, message: Header, arrival: int) -> None:
         # Compared with the stamps of neighbors: on the same clock.

@@ -155,7 +155,8 @@ class Altitude(NamedTuple):
         if least > -math.inf:
             low = max(min(least, up), -down) - rate - coming
             vertical = max(vertical, min(low / params.guarding.T_g, strongest))
-        return self._replace(commanded=goal if clear == speed else math.nan), vertical
+        within = min(max(goal, self.lowest), self.highest)  # bounds may have changed in flight
+        return self._replace(commanded=within if clear == speed else math.nan), vertical
 
 
 def _within_limits(ground: float, params: PlannerParams) -> tuple[float, float]:

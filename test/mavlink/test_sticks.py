@@ -246,3 +246,19 @@ def test_no_program_undoes_a_stick_that_no_mode_has_answered():
     assert flight.bridge.gate.permission.phase is Phase.GIVING_BACK
     assert 'the pilot took over' in flight.bridge.requests.offboard_obstacle(flight.now)
     assert flight.kinds(1) == {'brake'}
+
+
+@pytest.mark.slow
+def test_the_end_of_the_bridge_does_not_undo_a_moved_stick():
+    flight = Flight().follow(1.0)
+    flight.controller._sticks = True
+    flight.bridge.housekeeping.parameters.take_version(version(1, 18))
+    flight.bridge.sticks.moved = True
+    while flight.mode != 'POSCTL':
+        flight.fly(0.01)
+    flight.bridge.stop(flight.now)
+    assert flight.bridge.gate.flies  # no HEARTBEAT has shown it yet
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(1.0)
+    assert flight.mode == 'POSCTL'
