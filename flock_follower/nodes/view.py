@@ -270,7 +270,8 @@ class View(FlockNode):
         self._camera, self._transport = camera, transport
         self._source = OdometrySource(source)
         self._mounting = camera_mounting(camera.position, camera.rpy)
-        self._placed_child = any(source.child_position) or any(source.child_rpy)
+        self._static.forget()
+        self._child_configured = any(source.child_position) or any(source.child_rpy)
         self._calibration, self._model = b'', None
 
     def _take_calibration(self, message: CameraInfo) -> None:
@@ -300,10 +301,8 @@ class View(FlockNode):
         return pose(sample) @ self._mounting if isinstance(sample, OdometrySample) else None
 
     def _take_odometry(self, message: Odometry) -> None:
-        if not self._placed_child and (
-                child := self._static.transform(message.child_frame_id)) is not None:
-            self._placed_child = True
-            self._source.place_child(child)
+        if not self._child_configured:
+            self._static.place(self._source, message.child_frame_id)
         state = self._source.take(message, self.get_clock().now().nanoseconds)
         self._source.new_events()  # relative_pose reports them
         if state is not None:
