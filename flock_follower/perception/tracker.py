@@ -191,10 +191,11 @@ class Tracker:
         """Return why there is no odometry of a stamp, s, yet, or None."""
         return self._odometry.missing(stamp, extrapolate=False)
 
-    def attitude(self, stamp: float) -> Array | None:
-        """Return the own rotation (3, 3), body to odom, at a stamp, s, if known."""
+    def own_pose(self, stamp: float) -> Transform | None:
+        """Return the pose of the own body in odom at a stamp, s, if known."""
         own = self._odometry.at(stamp)
-        return None if isinstance(own, Missing) else quaternion_to_matrix(own.quaternion)
+        return None if isinstance(own, Missing) else Transform(
+            quaternion_to_matrix(own.quaternion), own.position)
 
     def wanted(self, stamp: float, model: CameraModel, camera: str = '') -> bool:
         """
