@@ -185,8 +185,8 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     Return the fit of the axes, or None if the images hardly moved.
 
     :param shifts: rows of stamp before, stamp after, and the numbers of :func:`shift`.
-    :param up: (3,), the upward direction in base_link as configured: besides the identity only
-        rotations that make it z are tried. None: it is z already, and all rotations are tried.
+    :param up: (3,), the upward direction in base_link as configured: only the identity and
+        rotations that turn it to z are tried. None: all rotations are tried.
     """
     every = np.array(shifts).reshape(-1, 2 + 3 * PART_ROWS * PART_COLUMNS)
     # The leader may fill one part, so the median stands for the image.
