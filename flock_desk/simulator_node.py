@@ -109,7 +109,7 @@ SPECS = [
          'topic with the true motion of the leader from another simulator (nav_msgs/Odometry, its '
          'truth/motion; vehicle = embedded); empty: the leader of the scenario'),
     Spec('leader_offset', [1.5, 0.0, 0.0],
-         "origin of the leader's odom frame in the own odom frame",
+         "origin of the leader's odom frame in the follower's odom frame",
          Range(unit='m'), fixed_length=True),
     Spec('end_if_busy', False,
          'end with exit code 3 if the flight falls 5 s behind the clock, or loses 2 % of its '
@@ -343,7 +343,7 @@ class Simulator(FlockNode):
         if self._external is None:
             late = now - self._step_due()
             return None if late < REPORTED_DELAY else (
-                ERROR, f'{late:.1f} s late: this machine is too slow, or too busy')
+                ERROR, f'the simulation is {late:.1f} s late: the machine is too slow or too busy')
         stalled = self._external.stalled(now, self._flight.time_ns)
         return (ERROR, stalled) if stalled else None
 

@@ -139,7 +139,7 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
         if full and published[full] in types:
             used[full] = ours, camera_name
         elif full:
-            faults[ours] = f'{full} holds {published[full]}, not {types[0]}'
+            faults[ours] = f'{full} has type {published[full]}, not {types[0]}'
         elif ours in (*needed, POSES):
             whose = f' of camera {camera_name}' if camera_name and ours != POSES else ''
             faults[ours] = f'no message on {" or ".join(choices)}{whose}'
@@ -306,7 +306,7 @@ class Evaluation(Listener):
         self.writer.write(topic, msgtype, time, message)
 
     def odometry(self, state: OdometryState) -> None:
-        """Take the own state, for the errors and for the rules of ``check``."""
+        """Take the ego state, for the errors and for the rules of ``check``."""
         self.errors.odometry(self._close_gaps(state))
         if self.own is not None and state.stamp < self.bag.start_ns + MAX_DURATION * NANOSECONDS:
             self.own.states.append(state)

@@ -302,7 +302,7 @@ def estimates(states: Iterable[OdometryState]) -> dict[int, dict[str, Estimate]]
     """
     Return the estimates of states published on ``neighbors``, by stamp, ns, and name.
 
-    Missing parts of a state are zero. Those of flight without odometry are in no frame of it.
+    Missing parts of a state are zero. States of flight without odometry are left out.
     """
     found: dict[int, dict[str, Estimate]] = {}
     for state in states:
@@ -321,7 +321,7 @@ def judged(visible: Array, stamps: NDArray[np.int64], neighbors: Sequence[Odomet
     """
     Return 1 for images with the leader in view, 0 for others, NaN in flight without odometry.
 
-    There the leader is found, but in no frame that has a truth.
+    In flight without odometry the leader is found, but no truth exists in the frame RELATIVE.
 
     :param visible: (n,); :param stamps: (n,), ns; :param neighbors: as published.
     """

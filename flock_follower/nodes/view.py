@@ -308,7 +308,7 @@ class View(FlockNode):
             self._use(state)
 
     def _use(self, state: OdometryState) -> None:
-        """Take the own state."""
+        """Take the ego state."""
         if not self._flight.take_odometry(state, time.monotonic()):
             return
         self._epoch = self._epoch or state.stamp

@@ -57,7 +57,7 @@ _ONES_3 = np.ones(3)
 
 class OdometrySample(NamedTuple):
     """
-    The own state at a stamp, s.
+    The ego state at a stamp, s.
 
     ``position`` (3,), m, and ``velocity`` (3,), m/s, in odom; ``quaternion`` (x, y, z, w) takes
     the body (FLU) to odom; ``angular_velocity`` (3,), rad/s, is in the body. ``travel`` (3,), m,

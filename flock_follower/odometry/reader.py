@@ -102,8 +102,8 @@ class SourceParams(Checked):
         'roll, pitch, yaw of the child frame of odom on base_link', live=False)
     twist_frame: str = parameter(
         AUTO, CHOICES,
-        'frame of the velocity in odom: child as in REP-105, or odom; none: derive the velocity '
-        'from the positions; auto: detect the frame', live=False)
+        'frame of the velocity in odom. child: child_frame_id (REP-105); odom: frame_id; none: '
+        'derive the velocity from the positions; auto: detect the frame', live=False)
     std: tuple[float, ...] = parameter(
         ODOMETRY_STD, Range(0.0, 100.0, above=True),
         'standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, '
@@ -115,7 +115,7 @@ _NO_LEVER: Array = np.zeros(3)
 
 class OdometrySource:
     """
-    The own odometry, message by message.
+    The ego odometry, message by message.
 
     ``twist`` describes the frame of the velocity.
     ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
@@ -174,7 +174,7 @@ class OdometrySource:
 
     def take(self, message: Any, now: int, clock_shift: int = 0) -> OdometryState | None:
         """
-        Return the own state, of base_link, from an Odometry message that arrived at ``now``, ns.
+        Return the ego state, of base_link, from an Odometry message that arrived at ``now``, ns.
 
         None if it is a repetition or out of order. A zero stamp means now.
 

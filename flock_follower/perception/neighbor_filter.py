@@ -66,7 +66,7 @@ from flock_follower.perception.range_gate import RangeGate
 _IDENTITY = np.eye(STATE_SIZE)
 #: Rows of the error state that are measured if the attitude is not used.
 _PLACE = _IDENTITY[POSITION]
-#: States to which the drift of the own position adds noise, (15, 15).
+#: States to which the drift of the ego position adds noise, (15, 15).
 _WANDERING = _PLACE.T.dot(_PLACE)
 #: Of the error state: the translation, and the rotation.
 _MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
@@ -128,7 +128,7 @@ class NeighborFilter:
     def __init__(self, params: FilterParams | None = None) -> None:
         self.params = params or FilterParams()
         self.walk = 0.0
-        """Drift of the own position, m/sqrt(s)."""
+        """Drift of the ego position, m/sqrt(s)."""
         self._steps: dict[float, tuple[Array, Array, Array]] = {}
         self.reset()
 
@@ -321,7 +321,7 @@ class NeighborFilter:
     def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
                      reference: Array = _BODY_CENTER) -> UpdateOutcome:
         """
-        Update with the own distance, m, to ``reference`` (3,), a point on the body, m.
+        Update with the measured distance, m, to ``reference`` (3,), a point on the body, m.
 
         The update corrects the state only along the line between the two: an uncertain direction
         would otherwise change the state across it, too. ``range_gate`` handles outliers. No track

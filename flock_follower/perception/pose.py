@@ -114,11 +114,11 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           last: Measurement | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return a neighbor near its expected place, or None if its markers are not there.
+    Return the measurement of a neighbor near its expected place, or None if no marker fits.
 
-    :param last: its last measurement, if any: if its print was smeared, edges are looked for only
-        if it is so no longer.
-    :param check_mirrored: whether to make sure that the mirrored attitude is not the better one.
+    :param last: its last measurement, if any. If its print was smeared, the smear is fitted first,
+        and edges only if the print is sharp again.
+    :param check_mirrored: whether to compare with the mirrored attitude.
     """
     if expected.pose is None:
         return None
@@ -240,10 +240,10 @@ def _hypothesis_of(found: EdgeFit) -> Hypothesis:
 def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
                 pose: Transform, up: Array | None) -> bool:
     """
-    Return whether a detected marker may show another attitude than a pose, ``T_camera_body``.
+    Return whether a detected marker fits another attitude than that of ``pose``, T_camera_body.
 
-    It costs half of :func:`locate`, which then says which one: one attitude is fitted, and the
-    mirrored one to the edges found so.
+    The costs are half of those of :func:`locate`, which then returns the right pose: one attitude
+    is fitted to the image, and the mirrored one to the edges that this fit found.
     """
     alone, starts = _starts_of(camera, sought, index, corners)
     for start in starts:

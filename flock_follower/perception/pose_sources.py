@@ -50,7 +50,7 @@ OLDEST_POSE = 1.0
 #: s: a pose and a frame whose stamps differ by less are of one image.
 SAME_IMAGE = 1e-3
 MOST_WAITING = 100  # poses, and frames: a bound on memory
-#: m: a body that is nearer to the own frame, or in odom to the own place, is none: some detectors
+#: m: a body that is nearer to its own frame, or in odom to this vehicle, is none: some detectors
 #: send zeros if they find none.
 NEAREST_POSE = 0.05
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
@@ -101,7 +101,7 @@ class PoseSources:
     """
     Takes poses and the stamps of frames; ``now`` is seconds on any clock that runs evenly.
 
-    ``frames`` has the optical frames of the own cameras on the body, ``static`` those of
+    ``frames`` has the optical frames of the ego cameras on the body, ``static`` those of
     ``/tf_static``.
 
     :param max_wait: the longest time for which a frame waits for its pose, s.

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Perception: from images and own odometry to the neighbors' states.
+Perception: from images and ego odometry to the neighbors' states.
 
 Detection in each image has up to three stages, the cheapest first:
 
@@ -149,7 +149,7 @@ class Tracker:
         self._forget()
 
     def restart(self) -> None:
-        """Forget everything, the own odometry too."""
+        """Forget everything, the ego odometry too."""
         self._odometry.clear()
         self._forget()
 
@@ -166,7 +166,7 @@ class Tracker:
         """The result of :meth:`wanted`, for the image that is processed next."""
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
-        """Take the own state; return whether time jumped back and everything restarted."""
+        """Take the ego state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
         walk = ODOMETRY_WALK if sample.derived else 0.0
         for hypotheses in self._hypotheses.values():
@@ -192,7 +192,7 @@ class Tracker:
         return self._odometry.missing(stamp, extrapolate=False)
 
     def own_pose(self, stamp: float) -> Transform | None:
-        """Return the pose of the own body in odom at a stamp, s, if known."""
+        """Return the pose of this vehicle in odom at a stamp, s, if known."""
         own = self._odometry.at(stamp)
         return None if isinstance(own, Missing) else Transform(
             quaternion_to_matrix(own.quaternion), own.position)
@@ -249,7 +249,7 @@ class Tracker:
         Return the estimate of a neighbor from its pose as another detector measured it.
 
         :param covariance: (6, 6), position, m, and rotation vector, rad, along the frame's axes.
-        :param T_body_frame: the frame on the own body; None: the frame is that of odom.
+        :param T_body_frame: the frame on the ego body; None: the frame is that of odom.
         """
         camera = self._sources[name]
         camera.T_body_camera = T_body_frame or Transform()

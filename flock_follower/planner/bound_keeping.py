@@ -108,7 +108,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     speed across for very little, and the command would switch from tick to tick.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
-    :param velocity: own velocity (3,), m/s.
+    :param velocity: ego velocity (3,), m/s.
     :param required: the bounds, the most important first (see ``sort_bounds``).
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)

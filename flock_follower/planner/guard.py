@@ -174,7 +174,7 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
 
     :param nominal: horizontal part of the nominal acceleration (3,), m/s^2, without limits.
     :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
-    :param velocity: own velocity when the command acts (3,), m/s.
+    :param velocity: ego velocity when the command acts (3,), m/s.
     """
     # Limits lowered in flight bind the law and coasting, not braking and keeping clear.
     lowered, start = (params.a_max, params.v_max), (params.strongest, params.fastest)
@@ -262,7 +262,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
     if not (here or n.received):
         places = [it._replace(spread=0.0, spreading=0.0) if _is_covered(it, scene) else it
                   for it in places]
-    # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
+    # A follower in sight may go back at any time, as fast and as hard as the ego vehicle can.
     headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
     found = list[Bound]()
     for place in places:

@@ -124,7 +124,7 @@ class PlannerLoop:
         return '' if bridge.name == ACTIVE else f'the bridge: {bridge}'
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
-        """Take the own state at a time, ns; only the newest since the last tick counts."""
+        """Take the ego state at a time, ns; only the newest since the last tick counts."""
         if not self._choice.takes(state):
             return
         stamp = self._newest
@@ -142,7 +142,7 @@ class PlannerLoop:
         """
         Take a neighbor's state.
 
-        :param received: whether another vehicle reported it; else the own camera sees it.
+        :param received: whether another vehicle reported it; else this vehicle sees it.
         :raises ValueError: if it is not in the frame of the odometry.
         """
         if not self._frame:

@@ -62,7 +62,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     """
     Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
-    :param fault: fault of the own odometry or of perception, or ''.
+    :param fault: fault of the ego odometry or of perception, or ''.
     :param youngest: age of the youngest estimate of a neighbor in sight, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: reason why it may not command yet, or why it was disengaged, or ''.

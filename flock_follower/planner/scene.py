@@ -15,7 +15,7 @@
 """
 The scene of one step, and the decision that the step makes.
 
-The scene is the own state, the neighbors at hand, and those lost that may still be near.
+The scene is the ego state, the neighbors at hand, and those lost that may still be near.
 
 ``survey`` also updates the memory: the neighbors to keep clear of, their motions, and the loss of
 sight of the neighbor that the vehicle followed.
@@ -212,7 +212,7 @@ def across_path(velocity: Sequence[float], offset: Array) -> Array:
     Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
 
     :param velocity: of the neighbor (3,), m/s.
-    :param offset: own position minus the neighbor's (3,), m.
+    :param offset: ego position minus the neighbor's (3,), m.
     """
     x, y, _ = velocity
     length = math.hypot(x, y)

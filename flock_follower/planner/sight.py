@@ -106,8 +106,8 @@ def visible(view: FieldsOfView, offset: Array, yaw: float, forward: float, margi
     """
     Return whether a neighbor is in an image, at least a margin, m, inside its edge.
 
-    :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
-    :param forward: own acceleration ahead, m/s^2, which tilts the camera.
+    :param offset: its position minus the ego one (3,), m; :param yaw: the ego one, rad.
+    :param forward: ego acceleration ahead, m/s^2, which tilts the camera.
     """
     x, y, z = offset.tolist()
     distance = math.hypot(x, y)
@@ -157,9 +157,9 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
 
     :param before: the occlusion in the last step.
     :param n: its newest estimate; None if there is none.
-    :param me: own state now.
+    :param me: ego state now.
     :param frames: stamps of the newest processed images, s, in their order.
-    :param forward: own acceleration ahead, m/s^2, which tilts the camera.
+    :param forward: ego acceleration ahead, m/s^2, which tilts the camera.
     """
     if n is None or n.received or not view:
         return None if n is None else before

@@ -170,7 +170,7 @@ def test_topics_and_times_select_messages(tmp_path):
 
 @pytest.mark.parametrize(('topics', 'said'), [
     ([('a', 'a_msgs/msg/B')], 'unknown message type a_msgs/msg/B'),
-    ([('b', STRING), ('b', BOOL)], f'/b: holds {STRING}, not {BOOL}')])
+    ([('b', STRING), ('b', BOOL)], f'/b: has type {STRING}, not {BOOL}')])
 def test_a_writer_refuses_what_no_reader_could_use(tmp_path, topics, said):
     with pytest.raises(BagError, match=said), BagWriter(tmp_path / 'bag') as bag:
         for topic, msgtype in topics:

@@ -192,7 +192,7 @@ def test_a_topic_of_another_type_is_reported(
 def test_topic_of_frames_without_a_header_is_reported(
         rig: Callable[..., Rig], ends: dict[str, list[str]]) -> None:
     ends['/camera_info'] = ['std_msgs/msg/String']
-    assert 'frames_topic /camera_info holds std_msgs/msg/String' in rig().problems()
+    assert 'frames_topic /camera_info has type std_msgs/msg/String' in rig().problems()
 
 
 def test_a_transform_needs_tf2_msgs(rig: Callable[..., Rig]) -> None:

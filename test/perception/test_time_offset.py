@@ -34,7 +34,7 @@ AHEAD = 0.16  # s from an image's stamp to the newest odometry when it is proces
 
 
 class Own(NamedTuple):
-    """The true motion of the own vehicle: it rolls, pitches and yaws a little."""
+    """The true motion of the ego vehicle: it rolls, pitches and yaws a little."""
 
     shaking: float = 1.0
 

@@ -61,9 +61,9 @@ def flown(seconds: float, leads: Callable[[float], tuple[float, float]] = lambda
           params: PlannerParams = PARAMS, first: float = 2.0, late: int = 0
           ) -> Iterator[tuple[Altitude, float, float]]:
     """
-    Yield the altitude held, the own height and climb at every tick.
+    Yield the altitude held, the ego height and climb at every tick.
 
-    :param leads: height and climb of the leader at a time; :param first: own height at first.
+    :param leads: height and climb of the leader at a time; :param first: ego height at first.
     :param late: periods after which a command is flown.
     """
     altitude, height, speed = Altitude.begin(me(first), 0.0, params), first, 0.0

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Inputs of the nodes: the own state from ``odom``, and static frames."""
+"""Inputs of the nodes: the ego state from ``odom``, and static frames."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ class OwnOdometry:
     Subscribes ``odom``; counts dropped messages, and reports the frames in use.
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
-    :param use: is called with the own state, of base_link, and the arrival of its message, ns;
+    :param use: is called with the ego state, of base_link, and the arrival of its message, ns;
         both on the node's clock, or on ``clock`` if one is given.
     :raises ValueError: if a parameter is out of range.
     """
