@@ -33,6 +33,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 import csv
 from itertools import zip_longest
+import math
 import multiprocessing
 import os
 from pathlib import Path
@@ -211,6 +212,18 @@ def differences(before: Table, after: Table) -> list[str]:
     return found
 
 
+def largest_difference(before: Table, after: Table) -> float:
+    """Return the largest difference of two numbers; NaN counts as none, a text as infinite."""
+    def between(old: str, new: str) -> float:
+        try:
+            return abs(float(old) - float(new))
+        except ValueError:
+            return math.inf
+    found = (between(old, new) for name in {*before, *after} for old, new in zip_longest(
+        before.get(name, []), after.get(name, []), fillvalue='none') if old != new)
+    return max((each for each in found if each == each), default=0.0)
+
+
 def main() -> int:
     """Freeze or compare, and return the exit code."""
     parser = argparse.ArgumentParser(description='Compare with frozen results, or freeze them.')
@@ -237,7 +250,8 @@ def main() -> int:
             found = differences(before, after) if before else [f'{part}: run make freeze']
             different += len(found)
             print('\n'.join([*(f'{part}: {each}' for each in found), f'{part}: {len(after) - 1} '
-                             f'rows compared, {len(found)} figures differ']), flush=True)
+                             f'rows compared, {len(found)} figures differ, by at most '
+                             f'{largest_difference(before, after):.1g}']), flush=True)
     return 1 if different else 0
 
 

@@ -278,7 +278,7 @@ class DetectorFlight(Listener):
             return
         now = self._flight.time_ns * 1e-9
         message = encode_setpoint(setpoint.acceleration, setpoint.yaw, round(now * 1e3))
-        self._vehicle.log.received(message, now)
+        self._vehicle.log.add_message(message, now)
         self._vehicle.autopilot.controller.on_setpoint(message, now)
         if self._has_begun:
             self._accelerations.append(math.hypot(message.afx, message.afy, message.afz))

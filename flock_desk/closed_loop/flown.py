@@ -117,10 +117,10 @@ class ExternalVehicle(_Reported):
         """Return the reported motion, interpolated."""
         state = self.at(time_ns)
         before, self._rotation = self._rotation, quaternion_to_matrix(state.quaternion)
-        self.log.moved((self._start_ns + time_ns) * 1e-9, state.position,
-                       self._rotation @ state.linear, np.full(3, np.nan),
-                       yaw_from_quaternion(state.quaternion), self._autopilot.armed,
-                       self._autopilot.mode)
+        self.log.add_state((self._start_ns + time_ns) * 1e-9, state.position,
+                           self._rotation @ state.linear, np.full(3, np.nan),
+                           yaw_from_quaternion(state.quaternion), self._autopilot.armed,
+                           self._autopilot.mode)
         # Not the reported rates: poses arrive unevenly, and the camera sees that.
         return state._replace(
             angular=matrix_to_rotation_vector(before.T @ self._rotation) / STEP_TIME)

@@ -111,7 +111,7 @@ class EmbeddedAutopilot:
         answers = []
         for message in self._codec.parse_buffer(data) or []:
             if now >= self._silent_until:
-                self.log.received(message, now)
+                self.log.add_message(message, now)
                 answers += self._packed(self._handle(message, now))
         return answers
 
@@ -126,8 +126,8 @@ class EmbeddedAutopilot:
         else:
             controller.step(now)
             messages = self._due_messages(now)
-        self.log.moved(now, vehicle.position, vehicle.velocity, vehicle.acceleration, vehicle.yaw,
-                       controller.armed, controller.mode)
+        self.log.add_state(now, vehicle.position, vehicle.velocity, vehicle.acceleration,
+                           vehicle.yaw, controller.armed, controller.mode)
         return self._packed(messages)
 
     def reboot(self, now: float, duration: float) -> None:

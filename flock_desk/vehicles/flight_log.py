@@ -69,15 +69,15 @@ class FlightLog:
         """Record a row of a kind, a key of the table of columns."""
         self._rows[kind].append(row)
 
-    def moved(self, now: float, position: Array, velocity: Array, acceleration: Array, yaw: float,
-              armed: bool, mode: str) -> None:
+    def add_state(self, now: float, position: Array, velocity: Array, acceleration: Array,
+                  yaw: float, armed: bool, mode: str) -> None:
         """Record a true state, unless the last record is too recent."""
         if now >= self._next_state:
             self._next_state = now + 0.99 / STATE_RATE
             self.add('state', now, position.copy(), velocity.copy(), acceleration.copy(), yaw,
                      armed, mode)
 
-    def received(self, message: Any, now: float) -> None:
+    def add_message(self, message: Any, now: float) -> None:
         """Record a setpoint or an ODOMETRY received at ``now``; others do not count."""
         kind = message.get_type()
         if kind == 'SET_POSITION_TARGET_LOCAL_NED':

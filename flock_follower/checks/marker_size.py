@@ -72,19 +72,19 @@ class Ratio(NamedTuple):
     """
     Ratio of the changes of the measured distance to the true changes, and its standard deviation.
 
-    ``moved``: RMS way of the camera, m; ``left``: RMS of the changes that remain, m.
+    ``way``: RMS way of the camera, m; ``left``: RMS of the changes that remain, m.
     """
 
     ratio: float
     deviation: float
-    moved: float
+    way: float
     left: float
 
     @property
     def at_rest(self) -> bool:
         """Return whether the marker was at rest, and the camera moved."""
-        return (self.moved >= MIN_WAY and RATIO_BOUNDS[0] <= self.ratio <= RATIO_BOUNDS[1]
-                and self.left <= MAX_UNEXPLAINED * min(self.ratio, 1.0) * self.moved)
+        return (self.way >= MIN_WAY and RATIO_BOUNDS[0] <= self.ratio <= RATIO_BOUNDS[1]
+                and self.left <= MAX_UNEXPLAINED * min(self.ratio, 1.0) * self.way)
 
 
 def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
@@ -101,7 +101,7 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
         np.array(seen.value('relative_pose', 'camera_position', [0.0, 0.0, 0.0])))
     if (found is None or not found.at_rest
             or SIGNIFICANT_SIGMAS * found.deviation > 3.0 * SIZE_WARNING):
-        moves = found is not None and found.moved >= MIN_WAY and not found.at_rest
+        moves = found is not None and found.way >= MIN_WAY and not found.at_rest
         return Finding(UNMEASURED, what, 'the leader moves' if moves else HOW, wanted)
     off, side = abs(found.ratio - 1.0), seen.marker_sides.get(number, 0.0)
     wrong = off > max(SIZE_WARNING, SIGNIFICANT_SIGMAS * found.deviation)

@@ -61,13 +61,13 @@ _HALVED = (15, 1)
 #: Portions of the search of a whole image, one in an image: a quick one, a thorough one with each
 #: window, and one at half the size.
 N_PORTIONS = 2 + len(_SEARCH_WINDOWS)
-_DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
-_SHORTEST = 40  # px, of an outline
+_MIN_DARKNESS = 7  # steps of the logarithm by which a dark pixel is below the window's mean
+_MIN_OUTLINE = 40  # px, length of an outline
 _MAX_ELONGATION = 32.0  # squared length over area; of a square 16
-_STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are none
-_HIDDEN = 0.35  # share of the visible area that a reflex may have hidden
-_SLIGHT = 0.05  # share of that: no reflex, but a blunt corner
-_MOST_CORNERS = 7  # of a hull: one with more is no square, whatever hides it
+_STRAIGHT_SHARE = 0.012  # of the outline's length: smaller deviations are no corners
+_MAX_HIDDEN_SHARE = 0.35  # of the visible area: a reflex may hide up to this
+_BLUNT_SHARE = 0.05  # of that largest hidden area: less is a blunt corner, not a reflex
+_MAX_CORNERS = 7  # of a hull: one with more is no square, whatever hides it
 #: Correlation of cells with the print, relative to the cells beside them, from which on a
 #: quadrilateral may be a marker. Of clutter, 99 % have less.
 _LIKENESS = 0.75
@@ -231,7 +231,7 @@ def quadrilaterals(logarithm: GrayImage,
     found = []
     for window, brush in windows:
         dark = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C,
-                                     cv2.THRESH_BINARY_INV, window, _DARKER)
+                                     cv2.THRESH_BINARY_INV, window, _MIN_DARKNESS)
         if brush > 1:
             dark = cv2.morphologyEx(
                 dark, cv2.MORPH_OPEN, np.ones((brush, brush), dtype=np.uint8))
@@ -239,26 +239,26 @@ def quadrilaterals(logarithm: GrayImage,
         holes = [] if tree is None else (tree[0, :, 3] >= 0).tolist()
         for contour, hole in zip(contours, holes):
             if hole or len(contour) < 4 or (
-                    sum(cv2.boundingRect(contour)[2:]) < _SHORTEST // 2):
+                    sum(cv2.boundingRect(contour)[2:]) < _MIN_OUTLINE // 2):
                 continue
             hull = cv2.convexHull(contour)
             length, area = cv2.arcLength(hull, True), cv2.contourArea(hull)
-            if _SHORTEST < length < math.sqrt(_MAX_ELONGATION * area):
-                outline = cv2.approxPolyDP(hull, _STRAIGHT * length, True)
-                if len(outline) > _MOST_CORNERS:
+            if _MIN_OUTLINE < length < math.sqrt(_MAX_ELONGATION * area):
+                outline = cv2.approxPolyDP(hull, _STRAIGHT_SHARE * length, True)
+                if len(outline) > _MAX_CORNERS:
                     continue
-                found += _squares(outline[:, 0].tolist(), _HIDDEN * area)
+                found += _squares(outline[:, 0].tolist(), _MAX_HIDDEN_SHARE * area)
     return np.reshape(found, (-1, 4, 2)).astype(float)
 
 
-def _squares(corners: list[list[float]], area: float) -> list[list[list[float]]]:
+def _squares(corners: list[list[float]], max_hidden: float) -> list[list[list[float]]]:
     """
     Return the quadrilaterals that convex corners (n, 2), clockwise, may be the visible part of.
 
     One side of five is where a reflex ends. Before, sides that hide next to nothing are removed,
     and of more than five those that hide least.
 
-    :param area: the largest that may be hidden, px^2.
+    :param max_hidden: the largest area that may be hidden, px^2.
     """
     count = len(corners)
     if count <= 4:
@@ -270,10 +270,10 @@ def _squares(corners: list[list[float]], area: float) -> list[list[list[float]]]
         if across > 1e-9:  # the sides before and after meet beyond this one
             further = ((cx - bx) * (dy - cy) - (cy - by) * (dx - cx)) / across
             hidden = 0.5 * further * ((bx - ax) * (cy - by) - (by - ay) * (cx - bx))
-            if hidden < area:
+            if hidden < max_hidden:
                 met = [bx + further * (bx - ax), by + further * (by - ay)]
                 fewer.append((hidden, [met, *(corners[(k + i) % count]
                                               for i in range(3, count + 1))]))
-    if fewer and (count > 5 or min(fewer)[0] < _SLIGHT * area):
-        return _squares(min(fewer)[1], area)
+    if fewer and (count > 5 or min(fewer)[0] < _BLUNT_SHARE * max_hidden):
+        return _squares(min(fewer)[1], max_hidden)
     return [square for _, square in fewer] if count == 5 else []

@@ -29,7 +29,7 @@ from flock_desk.external.external_autopilot import (
     ExternalAutopilot,
     ExternalVehicles,
     FORWARDED,
-    LATE,
+    REPORTED_SILENCE,
 )
 from flock_desk.runs.processes import free_udp_port
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
@@ -177,6 +177,6 @@ def test_whose_poses_stall_is_told_and_what_is_missing(two):
     assert found[0.4] == 'poses of the leader come too far apart: no image between them'
     assert found[0.88].startswith('no pose of the leader for 0.9 s: no image: PX4 is connected')
     assert 'odometry' not in found[0.88] and vehicles.gone(now) == ''
-    stalled = vehicles.stalled(now + LATE + 0.1, flown)
+    stalled = vehicles.stalled(now + REPORTED_SILENCE + 0.1, flown)
     assert stalled.startswith('no pose of the vehicle for 0.6 s: no image, no odometry: ')
     assert vehicles.gone(now + 10.1).startswith('no pose of the vehicle for 10 s on udpin:')

@@ -113,7 +113,7 @@ def test_a_third_autopilot_is_one_record(monkeypatch):
         ARDUPILOT, name='third', title='Third', firmware=mavlink.MAV_AUTOPILOT_PPZ,
         vehicle_types=frozenset({QUADROTOR}), velocity_flags=(mavlink.ESTIMATOR_VELOCITY_HORIZ, 0),
         estimator_status=mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, hover_thrust='THIRD_HOVER',
-        rules=(Rule('THIRD_LOSS', lambda value: value > 1.0, ' s: too long'),))
+        offboard_rules=(Rule('THIRD_LOSS', lambda value: value > 1.0, ' s: too long'),))
     monkeypatch.setattr(dialects, 'DIALECTS', {**DIALECTS, 'third': third})
     line, codec, now = FuzzedLine(), mavlink.MAVLink(None, 1, 1), 1.0
     bridge = Bridge(Link(line), Gate(), now=0.0)
