@@ -258,7 +258,8 @@ def _check_stamps(what: str, its: SourceSeen) -> Finding:
          'have the detector copy the stamp of its image, and the camera stamp the middle of the '
          'exposure, by the clock of the odometry: a turn moves the neighbor'),
         (abs(offset) + 2.0 * deviation <= MAX_SURE_OFFSET, OK, f'off by {measured}', ''),
-        (True, UNMEASURED, 'turned too little for the noise: yaw and roll it by hand', ''))
+        (True, UNMEASURED, f'known to ± {1e3 * deviation:.0f} ms: turned too little for the '
+         'noise; yaw and roll it by hand', ''))
 
 
 def _check_axes(what: str, its: SourceSeen) -> Finding:
