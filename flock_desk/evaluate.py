@@ -28,11 +28,11 @@ ROS and runs in the bag's own time, as fast as the machine allows. It writes
 The rules of ``check`` judge the bag at the same time: their errors and warnings stand before the
 figures, in ``summary.json`` under ``check``, and in the report.
 
-Of several bags, each has a folder of its name in OUT; a Dask cluster whose workers see the same
+With several bags, each has a folder of its name in OUT; a Dask cluster whose workers see the same
 files shares the work (``--scheduler``).
 
-Exit code 0, 1 if a bound of ``--expect`` is broken or ``check`` found an error (not with ``--check
-report``), 2 for a bag, file or option that is wrong: the greatest of all bags.
+Exit code: 1 if a bound of ``--expect`` is broken or ``check`` found an error (not with ``--check
+report``), 2 for a wrong bag, file or option, else 0. With several bags it is the highest one.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ import numpy as np
 
 from flock_desk.closed_loop.real_time_flight import MAX_SKIPPED_SHARE
 from flock_desk.runs.console import guarded, logs_in, within
-from flock_desk.runs.figure_table import bounds, LATE
+from flock_desk.runs.figure_table import bounds, UNBOUNDED
 from flock_desk.runs.flight import (
     External,
     Flown,
@@ -206,7 +206,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
-        nearest = FigureBound('nearest_m', nearest_allowed(scenario), load=LATE)
+        nearest = FigureBound('nearest_m', nearest_allowed(scenario), load=UNBOUNDED)
         judgments = report(
             out, f'{title}, a column of {followers}', scenario.summary, summary,
             [nearest, *limits], (), parts=summaries, load=flown.load)
@@ -228,17 +228,17 @@ def scenario_bounds(flight: LiveFlight, summary: Mapping[str, Any]) -> list[Figu
     if summary['leader_faster_than_v_max']:
         for key in ('time_in_band_share', 'true_distance_m.max'):
             demanded.pop(key, None)
-        demanded['planner.warnings'] = FigureBound('planner.warnings', least=1, load=LATE)
+        demanded['planner.warnings'] = FigureBound('planner.warnings', least=1, load=UNBOUNDED)
     # A pilot takes over on any machine.
     if str((summary['external'] or {}).get('ended_early')).startswith(TAKEN_OVER):
         demanded['duration_s'] = demanded['duration_s']._replace(load=0.0)
     found = [*demanded.values()]
     for outage in judged_outages(flight):
         key = f'outages.{outage_name(outage)}'
-        found += [FigureBound(f'{key}.hold_after_s', 0, hold_within(outage), LATE),
-                  FigureBound(f'{key}.reasons', least=1, load=LATE)]
+        found += [FigureBound(f'{key}.hold_after_s', 0, hold_within(outage), UNBOUNDED),
+                  FigureBound(f'{key}.reasons', least=1, load=UNBOUNDED)]
         if flight.duration > outage.at + outage.duration + AGAIN_WITHIN:
-            found.append(FigureBound(f'{key}.track_after_s', 0, AGAIN_WITHIN, LATE))
+            found.append(FigureBound(f'{key}.track_after_s', 0, AGAIN_WITHIN, UNBOUNDED))
     return found
 
 

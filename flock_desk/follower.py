@@ -16,8 +16,8 @@
 One follower as one object: events in, each with its time; estimates, commands and setpoints out.
 
 Perception, planner and setpoint control are the same three objects that the nodes drive, each in
-a process of its own. Here they share the clock of the caller: that of a bag in ``evaluate``, a
-simulated one in ``flights``, which needs no perception. Computing and passing messages on take no
+a process of its own. Here they share the clock of the caller: the bag's time in ``evaluate``, the
+simulated time in ``flights``, which runs no perception. Computing and passing messages on take no
 time: an estimate reaches the planner when its image comes, or the odometry that the image waits
 for; a command reaches the control at the tick.
 
@@ -86,7 +86,7 @@ class ImageOutcome:
 
 @dataclass
 class Tick:
-    """One tick of the planner, at a time in ns, with the own state it acted on."""
+    """One tick of the planner, at a time in ns, with the ego state it acted on."""
 
     time: int
     decision: Decision
@@ -110,7 +110,7 @@ class Listener:
         """Take a message that a node would publish, at a time in ns."""
 
     def odometry(self, state: OdometryState) -> None:
-        """Take the own state."""
+        """Take the ego state."""
 
     def image(self, outcome: ImageOutcome) -> None:
         """Take the outcome of an image."""
@@ -244,7 +244,7 @@ class Follower:
         self._announce_bridge_state()
 
     def odometry(self, time: int, state: OdometryState) -> None:
-        """Take the own state."""
+        """Take the ego state."""
         self.advance(time)
         self._listener.odometry(state)
         self._take_motion(time, state)

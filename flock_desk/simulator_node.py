@@ -73,8 +73,8 @@ from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
-LATE = 0.5  # s behind the clock from which on /diagnostics reports an error
-TOO_LATE = 5.0  # s behind the clock from which on it may end, see end_if_busy
+REPORTED_DELAY = 0.5  # s behind the clock from which on /diagnostics reports an error
+MAX_DELAY = 5.0  # s behind the clock from which on it may end, see end_if_busy
 #: Poses of an external vehicle arrive up to this much later, ns.
 POSES_LATE_NS = 40_000_000
 #: Messages taken in each service period: the vehicle ahead sends at 50 Hz, too.
@@ -109,7 +109,7 @@ SPECS = [
          'topic with the true motion of the leader from another simulator (nav_msgs/Odometry, its '
          'truth/motion; vehicle = embedded); empty: the leader of the scenario'),
     Spec('leader_offset', [1.5, 0.0, 0.0],
-         "origin of the leader's odom frame in the own odom frame",
+         "origin of the leader's odom frame in the follower's odom frame",
          Range(unit='m'), fixed_length=True),
     Spec('end_if_busy', False,
          'end with exit code 3 if the flight falls 5 s behind the clock, or loses 2 % of its '
@@ -307,19 +307,19 @@ class Simulator(FlockNode):
         arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
         now_ns = self._epoch_ns + self._flight.time_ns
         self._log.add('distance', due, self._flight.distance)
-        self._outputs.motion(now_ns, self._flight.follower)
+        self._outputs.publish_motion(now_ns, self._flight.follower)
         for sampled_ns, estimate in arrived:
-            self._outputs.odometry(ODOMETRY, self._epoch_ns + sampled_ns, estimate)
+            self._outputs.publish_odometry(ODOMETRY, self._epoch_ns + sampled_ns, estimate)
             self._log.add('odom', self._epoch_ns + sampled_ns, *_logged(estimate))
         if (distance := self._flight.measured()) is not None:
-            self._outputs.range(now_ns, distance)
+            self._outputs.publish_range(now_ns, distance)
         frame = self._flight.look(round((time.monotonic() - self._start) * 1e9))
         if frame is not None:
             self._take_image(self._epoch_ns + frame.stamp_ns, frame)
 
     def _take_image(self, stamp_ns: int, frame: RenderedImage) -> None:
         """Publish an image; log its truth, and some images, from the first leader on."""
-        self._outputs.image(stamp_ns, frame)
+        self._outputs.take_image(stamp_ns, frame)
         if frame.leader is None:
             return
         self._log.add('image', stamp_ns, frame.usable, *_logged(frame.follower),
@@ -342,8 +342,8 @@ class Simulator(FlockNode):
     def _problem(self, now: float) -> Problem | None:
         if self._external is None:
             late = now - self._step_due()
-            return None if late < LATE else (
-                ERROR, f'{late:.1f} s late: this machine is too slow, or too busy')
+            return None if late < REPORTED_DELAY else (
+                ERROR, f'the simulation is {late:.1f} s late: the machine is too slow or too busy')
         stalled = self._external.stalled(now, self._flight.time_ns)
         return (ERROR, stalled) if stalled else None
 
@@ -357,7 +357,7 @@ class Simulator(FlockNode):
         flight = self._flight
         if self._load is not None and flight.began_ns is not None:
             self._load.sample(now)
-            if self._external is None and now - self._step_due() > TOO_LATE:
+            if self._external is None and now - self._step_due() > MAX_DELAY:
                 self._blame('the simulator does not keep up with the clock')
         if self._external is not None and (gone := self._external.gone(now)):
             raise OSError(gone)

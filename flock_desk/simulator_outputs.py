@@ -81,30 +81,30 @@ class SimulatorOutputs:
         message.header.frame_id = ODOM_FRAME
         self._armed_at.publish(message)
 
-    def odometry(self, topic: str, stamp_ns: int, motion: TrueMotion) -> None:
+    def publish_odometry(self, topic: str, stamp_ns: int, motion: TrueMotion) -> None:
         """Publish odometry, or a true motion."""
         self._odometry[topic].publish(odometry(
             make, stamp_ns, ODOM_FRAME, _VEHICLES[topic], *motion[1:]))
 
-    def motion(self, stamp_ns: int, true: TrueMotion) -> None:
+    def publish_motion(self, stamp_ns: int, true: TrueMotion) -> None:
         """Publish the vehicle's true motion at 50 Hz, if another simulator subscribes."""
         if stamp_ns - self._motion_sent >= MOTION_PERIOD_NS and (
                 self._odometry[MOTION].get_subscription_count()):
             self._motion_sent = stamp_ns
-            self.odometry(MOTION, stamp_ns, true)
+            self.publish_odometry(MOTION, stamp_ns, true)
 
-    def range(self, stamp_ns: int, distance: float) -> None:
+    def publish_range(self, stamp_ns: int, distance: float) -> None:
         """Publish a measured distance to the leader, m."""
         message = Range(range=distance)
         message.header.frame_id = LEADER
         message.header.stamp = nanoseconds_to_stamp(stamp_ns)
         self._ranges.publish(message)
 
-    def image(self, stamp_ns: int, frame: RenderedImage) -> None:
+    def take_image(self, stamp_ns: int, frame: RenderedImage) -> None:
         """Publish the truth of an image, and keep the image until it is due."""
-        self.odometry(OWN_TRUTH, stamp_ns, frame.follower)
+        self.publish_odometry(OWN_TRUTH, stamp_ns, frame.follower)
         if frame.leader is not None:
-            self.odometry(LEADER_TRUTH, stamp_ns, frame.leader)
+            self.publish_odometry(LEADER_TRUTH, stamp_ns, frame.leader)
         self._pending.append((stamp_ns, frame))
 
     @property

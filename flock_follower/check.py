@@ -82,19 +82,19 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--config', type=Path, help='ROS 2 parameter file: BAG is checked with '
                         'its values (default: those flown, of a recording of the black box, else '
                         'config/follower.yaml of this package)')
-    parser.add_argument('--namespace', default='', help='of the nodes and topics')
+    parser.add_argument('--namespace', default='', help='namespace of the nodes and topics')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='one of our topics by another name, as odom:=/camera/odom/sample; '
                         'may be repeated')
-    parser.add_argument('--camera', default='', metavar='NAME', help='of several cameras the one '
-                        'to check (default: the first)')
+    parser.add_argument('--camera', default='', metavar='NAME', help='the camera to check, if '
+                        'there are several (default: the first)')
     parser.add_argument('--seconds', type=float, default=LISTENING_TIME,
                         help='how long to listen (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
     parser.add_argument('--report', type=Path, metavar='FILE', help='also write a zip file for a '
-                        'bug report: versions, findings, parameters, diagnostics, and the newest '
-                        'file of BAG, of the black box that runs, or of the newest recording in '
-                        'the default folder')
+                        'bug report: versions, findings, parameters, diagnostics, and one '
+                        'recorded file: the newest of BAG, else of the running black box, else of '
+                        'the newest recording in the default folder')
     options = parser.parse_args(args)
     try:
         seen, findings = _observe(options)

@@ -98,7 +98,7 @@ _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
 #: Of a neighbor: it is a part of topics, and the frame on ``/tf``.
 _NAME = re.compile(f'(?!.*/duplicate){WORDS}')
 _LONGEST_NAME = 100  # characters; ROS takes 247 for a whole topic
-#: Frames of the own vehicle, which a neighbor would replace on ``/tf``.
+#: Frames of the ego vehicle, which a neighbor would replace on ``/tf``.
 _OWN_FRAMES = ('base_link', 'map', 'odom')
 
 

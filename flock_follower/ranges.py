@@ -96,8 +96,8 @@ def check_topic(name: str, value: Any) -> None:
     :raises ValueError: naming the parameter, its value and the form of a topic.
     """
     if not isinstance(value, str) or not re.fullmatch(f'(/|~/)?{WORDS}', value):
-        raise ValueError(f'{name} = {value!r}: must be the name of a topic: words of letters, '
-                         'digits and _, none begins with a digit, with / between them')
+        raise ValueError(f'{name} = {value!r}: must be the name of a topic: words joined by /, '
+                         'each of letters, digits and _, not beginning with a digit')
 
 
 def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meaning: str = '', *,

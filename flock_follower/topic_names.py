@@ -125,7 +125,7 @@ def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = (),
         base = found[0].removesuffix('/compressed')
         transport = ' image_transport:=compressed' if ours == COMPRESSED_IMAGES else ''
         remap = f'launch with {_ARGUMENTS[ours]}:={base}{transport}{others}; here {remap}'
-    return f'{found[0]} holds {topics[found[0]]}: {remap}'
+    return f'{found[0]} has type {topics[found[0]]}: {remap}'
 
 
 def _offer_pose(topics: Mapping[str, str]) -> str:
@@ -135,5 +135,5 @@ def _offer_pose(topics: Mapping[str, str]) -> str:
     if not found:
         return ''
     _, _, full = found[0]
-    return (f'{full} holds {topics[full]}: have its source send {ODOMETRY}, or send the poses as '
-            'odometry (examples/pose_as_odometry.py, docs/sensors.md)')
+    return (f'{full} has type {topics[full]}: have its source send {ODOMETRY}, or send the poses '
+            'as odometry (examples/pose_as_odometry.py, docs/sensors.md)')

@@ -182,7 +182,7 @@ def seen_tags(recording: Recording, read: Read,
             view = CameraMotion.of(own, T_base_camera)
             for other in filters.values():
                 if other.newest is not None:
-                    other.shift(change * view.moving(other.newest.position - own.travel))
+                    other.add_error(change * view.moving(other.newest.position - own.travel))
         estimate = track.predict(time)
         if estimate is not None and time - began[tag.number] >= SETTLED:
             found.append(Seen(time, tag.number, visits[tag.number],

@@ -26,8 +26,10 @@ def test_each_seeded_bug_names_code_and_test_that_exist():
         found = (ROOT / bug.file).read_text(encoding='utf-8').count(bug.old)
         tested = f'def {function}(' in (ROOT / path).read_text(encoding='utf-8')
         if found == 0 or not tested:
-            stale.append((bug.file, bug.bug))
-    assert stale == []
+            stale.append(f'{bug.file}: {bug.bug}: ' + (
+                f'{path} has no {function}: correct "test"' if found else
+                f'the code has no {bug.old!r}: correct "old" and "new"'))
+    assert not stale, '\n'.join(['test/seeded_bugs.yaml:', *stale])
 
 
 def test_no_seeded_bug_has_its_name_twice():

@@ -65,7 +65,7 @@ _PRINT_VELOCITY_COVARIANCE = 1e-4 * np.eye(3)  # (m/s)^2
 
 
 class Sighted(NamedTuple):
-    """The estimate of one vehicle, in ENU, with the drift of the own odometry."""
+    """The estimate of one vehicle, in ENU, with the drift of the ego odometry."""
 
     name: str
     estimate: Estimate

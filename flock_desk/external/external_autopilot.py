@@ -59,7 +59,7 @@ TRUTH_TIMEOUT: Final[float] = 6.0
 """s of received messages without a truth, after which the estimate is used."""
 POSE_TIMEOUT: Final[float] = 30.0
 """s for the first pose of a vehicle."""
-LATE: Final[float] = 0.5
+REPORTED_SILENCE: Final[float] = 0.5
 """s without a pose, after which it is reported."""
 LOST: Final[float] = 10.0
 """s without a pose of the follower after which there is nothing to simulate."""
@@ -267,7 +267,7 @@ class ExternalVehicles:
             at = self.start_ns + time_ns - (POSE_GAP if name == 'leader' else 0)
             lacking = 'no image' if name == 'leader' else 'no image, no odometry'
             age = now - link.known
-            if age > LATE:
+            if age > REPORTED_SILENCE:
                 problems.append(
                     f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
             elif time_ns > 2 * POSE_GAP and not link.motion.knows(at):  # one pose at first

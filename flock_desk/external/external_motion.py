@@ -38,7 +38,7 @@ ESTIMATE: Final[str] = 'LOCAL_POSITION_NED'
 ATTITUDE: Final[str] = 'ATTITUDE_QUATERNION'
 CLOCK: Final[str] = 'SYSTEM_TIME'
 TRUTHS: Final[tuple[str, ...]] = (SIM_STATE, HIL_STATE)
-MEMORY: Final[int] = 256
+MAX_POSES: Final[int] = 256
 """Number of poses kept: more than one second."""
 POSE_GAP: Final[int] = 150_000_000
 """Poses farther apart than this, ns, have no known motion between them."""
@@ -76,7 +76,7 @@ class ExternalMotion:
         """Name of the message that places it; '' until a truth comes, or ESTIMATE is set."""
         self.times: list[tuple[float, float]] = []
         """Our time and the autopilot's time since boot, s: simulators may be slow."""
-        self._poses: deque[Motion] = deque(maxlen=MEMORY)
+        self._poses: deque[Motion] = deque(maxlen=MAX_POSES)
         self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
         self.origin: Array | None = None
         """Latitude, longitude (deg), height (m); ENU of an estimate. None before any pose."""

@@ -139,7 +139,7 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
         if full and published[full] in types:
             used[full] = ours, camera_name
         elif full:
-            faults[ours] = f'{full} holds {published[full]}, not {types[0]}'
+            faults[ours] = f'{full} has type {published[full]}, not {types[0]}'
         elif ours in (*needed, POSES):
             whose = f' of camera {camera_name}' if camera_name and ours != POSES else ''
             faults[ours] = f'no message on {" or ".join(choices)}{whose}'
@@ -306,7 +306,7 @@ class Evaluation(Listener):
         self.writer.write(topic, msgtype, time, message)
 
     def odometry(self, state: OdometryState) -> None:
-        """Take the own state, for the errors and for the rules of ``check``."""
+        """Take the ego state, for the errors and for the rules of ``check``."""
         self.errors.odometry(self._close_gaps(state))
         if self.own is not None and state.stamp < self.bag.start_ns + MAX_DURATION * NANOSECONDS:
             self.own.states.append(state)
@@ -367,14 +367,14 @@ class Evaluation(Listener):
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
              namespace: str = '', remaps: Mapping[str, str] | None = None,
-             checked: bool = True) -> Evaluation:
+             with_check: bool = True) -> Evaluation:
     """
     Run a bag through the chain and write the messages that the nodes would have published.
 
     :param values: the parameters of every node, see ``parameters.files.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag; ``remaps``: their names, by ours, if they differ.
-    :param checked: whether the rules of ``check`` judge the bag, too.
+    :param with_check: whether the rules of ``check`` judge the bag, too.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
     :raises OSError: if the result cannot be written.
     """
@@ -392,7 +392,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
                 deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
             system = None
-            if checked:
+            if with_check:
                 evaluation.own = OwnMotion(evaluation.source)
                 system = RecordedSystem(bag, values, '', namespace, remaps, evaluation.own)
             _play(bag, used, evaluation, system, frames)

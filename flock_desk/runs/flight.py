@@ -49,7 +49,7 @@ from flock_follower.mavlink.transport import open_transport
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray',
             'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory']
-ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
+GLOBAL_ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
 START_TIMEOUT = 40.0  # s for all processes to be there: a busy machine takes its time
 READY_TIMEOUT = 90.0  # s for an external estimator, without which the autopilot does not arm
 #: s of take-off requests until it is armed again: longer than the bridge waits for the climb.
@@ -259,7 +259,7 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
     else:
         forward = str(external.forward_odometry).lower()
         bridge = [f'connection:={external.connection}', f'forward_odometry:={forward}',
-                  f'global_origin:={ORIGIN}' if external.forward_odometry
+                  f'global_origin:={GLOBAL_ORIGIN}' if external.forward_odometry
                   else f'velocity_disagreement:={GPS_DISAGREEMENT}']
         vehicle = ['vehicle:=external', f'truth_connection:={external.truth}',
                    f'require_truth:={forward}']

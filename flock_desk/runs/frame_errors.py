@@ -16,10 +16,10 @@
 Errors of the estimates against the truth: one row per image and neighbor.
 
 Errors are those of the neighbor's state relative to the follower, each in its follower's body
-frame (FLU): estimate minus own odometry against truth minus truth, so that drift, which is common
+frame (FLU): estimate minus ego odometry against truth minus truth, so that drift, which is common
 to leader and follower in odom, does not count. Their covariances follow from the published ones.
 
-- Position: z = R' (p_L - p_F). The filter measures p_L relative to the own position, and its
+- Position: z = R' (p_L - p_F). The filter measures p_L relative to the ego position, and its
   covariance P_p is that of the leader relative to it: the error of p_F is in p_L too and cancels.
   P = R' P_p R.
 - Velocity: z = R' (v_L - v_F). The filter takes v_L from positions measured relative to a point
@@ -92,17 +92,17 @@ class FrameErrors:
         self._T_camera_body = {name: place.inverse() for name, place in mounted.items()}
         self._start = start
         self._own = array('d')
-        self._true = {name: array('d') for name in ('', *self._neighbors)}  # '': the own state
+        self._true = {name: array('d') for name in ('', *self._neighbors)}  # '': the ego state
         self._stamps = array('d')
         self._cameras: list[str] = []
         self._seen = {name: array('d') for name in self._neighbors}
 
     def odometry(self, state: OdometryState) -> None:
-        """Take the own odometry."""
+        """Take the ego odometry."""
         self._take(self._own, state)
 
     def truth(self, state: OdometryState, own: bool = False) -> None:
-        """Take the own true state, or that of the neighbor that the child frame names."""
+        """Take the ego true state, or that of the neighbor that the child frame names."""
         name = '' if own else state.child
         if name in self._true:
             self._take(self._true[name], state)
@@ -227,7 +227,7 @@ def _sample(row: Array, since: float) -> OdometrySample:
 
 
 def _relative(neighbor: _States, own: _States) -> _States:
-    """Return a neighbor's states relative to the own ones, in the follower's body."""
+    """Return a neighbor's states relative to the ego ones, in the follower's body."""
     to_body = own.rotation.transpose(0, 2, 1)
     return _States(np.einsum('nij,nj->ni', to_body, neighbor.position - own.position),
                    np.einsum('nij,nj->ni', to_body, neighbor.velocity - own.velocity),

@@ -42,7 +42,7 @@ matplotlib.rcParams.update({
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'RELATIVE', 'TRACK')  # from bottom to top
-LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
+MAX_LINE_GAP = 0.5  # s: across a longer gap no line is drawn
 LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
 PAIR_PERIOD = 5.0  # s between the lines from follower to leader
 MAX_PAIRS = 24  # lines from follower to leader
@@ -90,7 +90,7 @@ def chapters(flight: Flight, note: str = '') -> list[Chapter]:
 
 def _with_gaps(table: Table) -> Mapping[str, Array]:
     """Return a table with a row of NaN if images are missing, and so no line."""
-    breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
+    breaks = np.flatnonzero(np.diff(table['time']) > MAX_LINE_GAP) + 1
     return {name: np.insert(column, breaks, np.nan, axis=0) for name, column in table.items()}
 
 

@@ -222,10 +222,10 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
             (-1, 3))
     sent = flown(log['setpoint_time'])
     neighbors, stamps = _received(record), log['image_stamp']
-    own = _states(log, 'odom', log['odom_stamp'])
+    own = _logged_states(log, 'odom', log['odom_stamp'])
     table = compared(
         estimates(neighbors), own,
-        _states(log, 'follower', stamps), _states(log, LEADER_NAME, stamps), stamps,
+        _logged_states(log, 'follower', stamps), _logged_states(log, LEADER_NAME, stamps), stamps,
         judged(log['image_usable'], stamps, neighbors), epoch)
     return LiveFlight(
         duration=ended - began, params=scenario.flight.planner(True), table=table,
@@ -273,7 +273,7 @@ def _of(array: Any, namespace: str) -> Any:
     return array
 
 
-def _states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryState]:
+def _logged_states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryState]:
     zero, unknown = np.zeros(3), np.zeros((6, 6))
     return [OdometryState(int(stamp), 'odom', name, position, quaternion, velocity, zero,
                           unknown, unknown, np.eye(3))
@@ -302,7 +302,7 @@ def estimates(states: Iterable[OdometryState]) -> dict[int, dict[str, Estimate]]
     """
     Return the estimates of states published on ``neighbors``, by stamp, ns, and name.
 
-    Missing parts of a state are zero. Those of flight without odometry are in no frame of it.
+    Missing parts of a state are zero. States of flight without odometry are left out.
     """
     found: dict[int, dict[str, Estimate]] = {}
     for state in states:
@@ -321,7 +321,7 @@ def judged(visible: Array, stamps: NDArray[np.int64], neighbors: Sequence[Odomet
     """
     Return 1 for images with the leader in view, 0 for others, NaN in flight without odometry.
 
-    There the leader is found, but in no frame that has a truth.
+    In flight without odometry the leader is found, but no truth exists in the frame RELATIVE.
 
     :param visible: (n,); :param stamps: (n,), ns; :param neighbors: as published.
     """

@@ -111,7 +111,7 @@ def hold_figures(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[fl
         if state == 'HOLD' and begin < until:
             total += until - begin
             why = next((reason for t, reason in reasons if begin <= t <= until and reason),
-                       'too short for its reason to be on /diagnostics')
+                       'too short: its reason was not published on /diagnostics')
             holds[f'at_{begin:.1f}_s'] = f'{until - begin:.1f} s: {why}'
     return {'planner': {'hold_count': len(holds), 'hold_s': total}, 'holds': holds}
 

@@ -54,7 +54,7 @@ class PerceptionNoise:
     """
 
     lateral: float = 0.0005
-    """Across the line of sight, rad times the distance: the own attitude, image by image."""
+    """Across the line of sight, rad times the distance: the ego attitude, image by image."""
     range_constant: float = 0.0003
     """Along the line of sight, m ..."""
     range_growth: float = 0.0003

@@ -23,7 +23,7 @@ No speed limit applies to acceleration setpoints; vertical acceleration 0 leaves
 When external vision stops OFFBOARD stays, and drifts.
 
 After arming the motors spin up, then idle until a setpoint demands a climb: any upward
-acceleration, however small. A ramp then limits the climb rate of the own modes, and leaves
+acceleration, however small. A ramp then limits the climb rate of PX4's modes, and leaves
 acceleration setpoints alone. The land detector looks at the thrust: it reports the
 take-off at once, and a landing only while a downward velocity is commanded. Acceleration setpoints
 command none, so that a vehicle that they push onto the ground stays in the air for PX4.

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -38,7 +39,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 
 from flock_follower.bags.bag_files import BagFiles, find_files
 from flock_follower.bags.message_types import migration_obstacle, typestore
-from flock_follower.bags.sequential import SequentialReader
+from flock_follower.bags.sequential import in_order, overlap, SequentialReader, Span
 
 _UNREADABLE = 'corrupt, truncated or unsupported'
 _UNTYPED = '__schemaless__'  # rosbags' type of a channel whose schema the summary does not repeat
@@ -134,9 +135,12 @@ class Bag(AbstractContextManager['Bag']):
         mixed.
         """
         if isinstance(self._reader, SequentialReader):
-            return self._reader.disorder
-        back = 0
-        for file in _storages(self._reader) or [getattr(self._reader, 'storage', None)]:
+            return max(self._reader.disorder, overlap(self._reader.spans.values()))
+        files = _storages(self._reader)
+        back = overlap(Span(
+            file.metadata.start_time, file.metadata.end_time,
+            {connection.topic for connection in file.connections}) for file in files)
+        for file in files or [getattr(self._reader, 'storage', None)]:
             newest = 0
             for chunk in sorted(getattr(file, 'chunks', []), key=lambda c: c.chunk_start_offset):
                 newest = max(newest, chunk.message_start_time)
@@ -175,9 +179,8 @@ class Bag(AbstractContextManager['Bag']):
         names = self.select(topics)
         yielded = 0
         with failures(self.path, self._unreadable):
-            for connection, stamp_ns, raw in self._reader.messages(
-                    connections=[c for name in names for c in self._connections[name]],
-                    start=start_ns, stop=stop_ns):
+            for connection, stamp_ns, raw in self._read(
+                    [c for name in names for c in self._connections[name]], start_ns, stop_ns):
                 topic = self.topics[absolute(connection.topic)]
                 yielded += 1
                 if isinstance(connection.ext, ConnectionExtRosbag1):
@@ -188,6 +191,18 @@ class Bag(AbstractContextManager['Bag']):
             raise BagError(
                 f'{self.path}: {self._unreadable}: {yielded} of {announced} announced messages '
                 f'found; if only metadata.yaml is wrong: ros2 bag reindex {self.path}')
+
+    def _read(self, connections: Collection[Connection], start: int | None, stop: int | None
+              ) -> Iterator[tuple[Connection, int, bytes]]:
+        files = _storages(self._reader)
+        if not files:
+            return self._reader.messages(connections=connections, start=start, stop=stop)
+        # rosbags reads the files of a folder one after the other, however they overlap in time.
+        folders = [copy(self._reader.storage) for _ in files]  # type: ignore[union-attr]
+        for folder, file in zip(folders, files):
+            folder.storages = [file]
+        return in_order((file.metadata.start_time, folder.messages(connections, start, stop))
+                        for folder, file in zip(folders, files))
 
     def close(self) -> None:
         """Close the files."""

@@ -19,12 +19,14 @@ rosbags needs a file's end and its index, and a folder's ``metadata.yaml``, and 
 one channel that is not of ROS 2. This reader needs none of them: it takes the files one after the
 other, one in MCAP without an end up to its last good chunk. The reader uses only the files'
 content. MCAP files are read by the library mcap; on a vehicle it need not be installed.
+
+``in_order`` and ``overlap`` serve both readers: the files of a folder may overlap in time.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import closing
 import heapq
 from pathlib import Path
@@ -58,19 +60,30 @@ class _Channel(NamedTuple):
 
 
 _Record = tuple[_Channel, int, bytes]
+_Message = tuple[Connection, int, bytes]
+
+
+class Span(NamedTuple):
+    """First stamp of a file, one ns more than its last stamp, and its topics."""
+
+    start: int
+    end: int
+    topics: set[str]
 
 
 class SequentialReader:
     """
     Files of a recording, read one after the other, with rosbags' interface of a reader.
 
-    Messages come in the order of their stamps within each file. ``start_time`` is the stamp of
-    the first message, ``end_time`` a nanosecond more than that of the last, ns.
+    Messages come in the order of their stamps. ``start_time`` is the stamp of the first message,
+    ``end_time`` a nanosecond more than that of the last, ns.
     """
 
     def __init__(self, files: Sequence[Path]) -> None:
         self.start_time, self.end_time = 2**63, 0
         self._files = files
+        self.spans: dict[Path, Span] = {}
+        """Of each file that holds messages."""
         self._connections: dict[_Channel, Connection] = {}
         self.disorder = 0  # ns by which a message may be older than one before it in its file
 
@@ -96,8 +109,14 @@ class SequentialReader:
                 counts[channel] += 1
                 newest = max(newest, stamp)
                 self.disorder = max(self.disorder, newest - stamp)
-                self.start_time = min(self.start_time, stamp)
-                self.end_time = max(self.end_time, stamp + 1)
+                span = self.spans.setdefault(file, Span(stamp, stamp + 1, set()))
+                span.topics.add(channel.topic)
+                if not span.start <= stamp < span.end:
+                    self.spans[file] = span._replace(
+                        start=min(span.start, stamp), end=max(span.end, stamp + 1))
+            if file in self.spans:
+                self.start_time = min(self.start_time, self.spans[file].start)
+                self.end_time = max(self.end_time, self.spans[file].end)
         if not counts:
             raise ValueError('it holds no message, or was cut short before its first: nothing is '
                              'in it')
@@ -106,28 +125,68 @@ class SequentialReader:
             for number, (channel, count) in enumerate(counts.items(), 1)}
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
-                 stop: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
+                 stop: int | None = None) -> Iterator[_Message]:
         """Yield the messages of some connections from ``start`` to before ``stop``, ns."""
         wanted = {one.id for one in connections}
-        stop = self.end_time if stop is None else stop
-        for file in self._files:
-            newest = 0
-            held: list[tuple[int, int, Connection, bytes]] = []
-            for number, (channel, stamp, data) in enumerate(_records(file)):
-                newest = max(newest, stamp)
-                connection = self._connections[channel]
-                if connection.id in wanted and (start or 0) <= stamp < stop:
-                    heapq.heappush(held, (stamp, number, connection, data))
-                while held and held[0][0] <= newest - self.disorder:
-                    yield _message_of(heapq.heappop(held))
-            while held:
+        first, end = start or 0, self.end_time if stop is None else stop
+        return in_order((span.start, self._messages_of(file, wanted, first, end))
+                        for file, span in self.spans.items())
+
+    def _messages_of(self, file: Path, wanted: Collection[int], start: int, stop: int
+                     ) -> Iterator[_Message]:
+        newest = 0
+        held: list[tuple[int, int, Connection, bytes]] = []
+        for number, (channel, stamp, data) in enumerate(_records(file)):
+            newest = max(newest, stamp)
+            connection = self._connections[channel]
+            if connection.id in wanted and start <= stamp < stop:
+                heapq.heappush(held, (stamp, number, connection, data))
+            while held and held[0][0] <= newest - self.disorder:
                 yield _message_of(heapq.heappop(held))
+        while held:
+            yield _message_of(heapq.heappop(held))
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
 
 
-def _message_of(held: tuple[int, int, Connection, bytes]) -> tuple[Connection, int, bytes]:
+def overlap(files: Iterable[Span]) -> int:
+    """Return by how much a file begins before an earlier one with its topics ends, ns."""
+    longest, before = 0, list[Span]()
+    for span in files:
+        for other in before:
+            if span.end > other.start and span.topics & other.topics:
+                longest = max(longest, other.end - 1 - span.start)
+        before.append(span)
+    return longest
+
+
+def in_order(files: Iterable[tuple[int, Iterator[_Message]]]) -> Iterator[_Message]:
+    """
+    Yield the messages of files by their stamps; those of one stamp in the order of the files.
+
+    :param files: of each file the stamp of its first message, ns, and its messages by their
+        stamps. Nothing is read of a file before that stamp is reached.
+    """
+    waiting = sorted(((start, number, messages)
+                      for number, (start, messages) in enumerate(files)), reverse=True)
+    opened: list[tuple[int, int, _Message, Iterator[_Message]]] = []
+
+    def read_on(number: int, messages: Iterator[_Message]) -> None:
+        message = next(messages, None)
+        if message is not None:
+            heapq.heappush(opened, (message[1], number, message, messages))
+
+    while waiting or opened:
+        if waiting and (not opened or waiting[-1][0] <= opened[0][0]):
+            read_on(*waiting.pop()[1:])
+        else:
+            _, number, message, messages = heapq.heappop(opened)
+            yield message
+            read_on(number, messages)
+
+
+def _message_of(held: tuple[int, int, Connection, bytes]) -> _Message:
     stamp, _, connection, data = held
     return connection, stamp, data
 

@@ -104,7 +104,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             topic = self._topics[name] = RecordedTopic(
                 absolute(name), msgtype, absolute(name) in self._latched)
         if topic.msgtype != msgtype:
-            raise BagError(f'{self.path}: {topic.name}: holds {topic.msgtype}, not {msgtype}')
+            raise BagError(f'{self.path}: {topic.name}: has type {topic.msgtype}, not {msgtype}')
         return topic
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_follower.checks.image_motion import OwnPath, shift, small
+from flock_follower.checks.image_motion import measure_shifts, OwnPath, small
 from flock_follower.checks.observations import (
     NodeStatus,
     Observations,
@@ -55,12 +55,10 @@ from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pose_messages import from_pose
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 
-#: Number of images that are searched for markers, and least time between them, s.
-PICTURES: Final = 25
-PICTURE_PERIOD: Final = 0.1
-#: Time between two images whose shift is measured, s, and the number of pairs.
-PAIR: Final = (0.03, 0.16)
-PAIRS: Final = 90
+N_PICTURES: Final = 25  # images that are searched for markers
+PICTURE_PERIOD: Final = 0.1  # s, least time between two of these images
+PAIR_GAP: Final = (0.03, 0.16)  # s, least and largest time between two images that are compared
+N_PAIRS: Final = 90  # pairs of images whose shift is measured
 #: The name of all topics with the poses of another detector.
 POSES: Final = 'poses'
 
@@ -74,8 +72,8 @@ class Collector:
 
     def __init__(self, observations: Observations, duration: float) -> None:
         self.observations = observations
-        self._picture_period = max(PICTURE_PERIOD, duration / PICTURES)
-        self._pair_period = duration / PAIRS
+        self._picture_period = max(PICTURE_PERIOD, duration / N_PICTURES)
+        self._pair_period = duration / N_PAIRS
         self._kept: list[tuple[Picture, GrayImage]] = []
         self._next_picture = self._next_pair = -math.inf
         self._small: tuple[float, Array] | None = None
@@ -156,13 +154,13 @@ class Collector:
     def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
         """Measure the shift since the previous image, if the time between both is suitable."""
         reduced, before = small(pixels), self._small
-        if before is not None and stamp - before[0] < PAIR[0]:
+        if before is not None and stamp - before[0] < PAIR_GAP[0]:
             return  # the next one is further off
-        if before is None or stamp - before[0] > PAIR[1]:
+        if before is None or stamp - before[0] > PAIR_GAP[1]:
             self._small = stamp, reduced
             return
         self.observations.shifts.append(
-            [before[0], stamp, *shift(before[1], reduced, pixels.shape[1]).ravel()])
+            [before[0], stamp, *measure_shifts(before[1], reduced, pixels.shape[1]).ravel()])
         self._small, self._next_pair = None, arrival + self._pair_period
 
     def finish(self, config: NeighborConfig) -> None:

@@ -122,7 +122,7 @@ class OwnPath:
 
 
 def small(image: GrayImage) -> Array:
-    """Return an image reduced to ``COMPARED_WIDTH`` px, the input of :func:`shift`."""
+    """Return an image reduced to ``COMPARED_WIDTH`` px, the input of :func:`measure_shifts`."""
     while image.shape[1] >= 2 * COMPARED_WIDTH:  # halving is the fastest
         image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     height, width = image.shape
@@ -130,7 +130,7 @@ def small(image: GrayImage) -> Array:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def shift(before: Array, after: Array, width: int) -> Array:
+def measure_shifts(before: Array, after: Array, width: int) -> Array:
     """
     Return the shift of each part of the image right and down, px at ``COMPARED_WIDTH``.
 
@@ -184,7 +184,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     """
     Return the fit of the axes, or None if the images hardly moved.
 
-    :param shifts: rows of stamp before, stamp after, and the numbers of :func:`shift`.
+    :param shifts: rows of stamp before, stamp after, and the numbers of :func:`measure_shifts`.
     :param up: (3,), the upward direction in base_link as configured: besides the identity only
         rotations that make it z are tried. None: it is z already, and all rotations are tried.
     """

@@ -68,7 +68,7 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
     """
     Return the outcome of the poses of each neighbor in the filter and gates of relative_pose.
 
-    :param cameras: the optical frames of the own cameras on the body, by name.
+    :param cameras: the optical frames of the ego cameras on the body, by name.
     :param max_wait: the longest time for which a pose waits for odometry of its stamp, s.
     """
     perceiver = Perceiver(Tracker(config, Transform()), max_wait=max_wait)
@@ -191,7 +191,7 @@ def _check_published(seen: Observations, what: str, its: SourceSeen, topic: Topi
         (not number and not seen.live, ERROR, f'the bag lacks {full}', 'record it'),
         (not number, ERROR, f'no node publishes {full}', 'start the other detector'),
         (number > 1, ERROR, f'{number} publishers of {full}: none is used', 'end all but one'),
-        (not {*POSE_TYPES} & {*topic.types}, ERROR, f'{full} holds {", ".join(topic.types)}',
+        (not {*POSE_TYPES} & {*topic.types}, ERROR, f'{full} has type {", ".join(topic.types)}',
          f'have it send {POSE_TYPES[0]}'),
         (True, OK, f'{full}; without a marker the guard keeps no viewing angle', ''))
 

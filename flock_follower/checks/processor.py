@@ -129,7 +129,7 @@ def _waits(before: Mapping[Path, int], after: Mapping[Path, int]) -> list[float]
     return [1e-9 * (waited - before.get(path, 0)) for path, waited in after.items()]
 
 
-def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
+def read_counters(process_ids: Iterable[int], now: float, proc: Path = PROC,
                   usable: Iterable[int] | None = None, ended: float = 0.0) -> Counters | None:
     """
     Return the counters of some processes and of the machine, None if the kernel has none.
@@ -137,8 +137,8 @@ def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
     :param now: s. :param usable: numbers of the processors; by default those of this process.
     :param ended: the processor time, s, of all children of this process that have ended.
     """
-    processes = list(processes)
-    waited = {path: time for process in processes
+    process_ids = list(process_ids)
+    waited = {path: time for process in process_ids
               for path, time in waits_of(process, proc).items()}
     names = {f'cpu{number}' for number in (
         os.sched_getaffinity(0) if usable is None else usable)}
@@ -151,7 +151,7 @@ def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
                 ticks += sum(map(int, fields[:3])) + sum(map(int, fields[5:8]))
     except (OSError, ValueError):
         return None
-    ran = {process: time for process in processes if (time := ran_for(process, proc))}
+    ran = {process: time for process in process_ids if (time := ran_for(process, proc))}
     return Counters(now, waited, ran, ended, ticks * _TICK) if waited else None
 
 
@@ -171,16 +171,16 @@ class LoadMeter:
     """
     Measures the load of some processes, window by window.
 
-    :param processes: returns their ids.
+    :param find_ids: returns their ids.
     :param proc: the folder of the kernel's process files.
     :param usable: numbers of the processors; by default those of this process.
     :param ended: returns the processor time, s, of all children that have ended.
     """
 
-    def __init__(self, processes: Callable[[], Iterable[int]], proc: Path = PROC,
+    def __init__(self, find_ids: Callable[[], Iterable[int]], proc: Path = PROC,
                  usable: Iterable[int] | None = None,
                  ended: Callable[[], float] = ended_children_ran_for) -> None:
-        self._processes, self._proc, self._ended = processes, proc, ended
+        self._find_ids, self._proc, self._ended = find_ids, proc, ended
         self._usable = tuple(os.sched_getaffinity(0) if usable is None else usable)
         self._recent: deque[Counters] = deque()
         self._windows: list[tuple[float, Load]] = []
@@ -190,7 +190,7 @@ class LoadMeter:
         if self._recent and now - self._recent[-1].time < LOAD_PERIOD:
             return
         counters = read_counters(
-            self._processes(), now, self._proc, self._usable, self._ended())
+            self._find_ids(), now, self._proc, self._usable, self._ended())
         if counters is None:
             return
         self._recent.append(counters)

@@ -53,7 +53,7 @@ MAX_DURATION: Final = 300.0
 DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: The topics to take, and their types.
-READ: Final = {**{name: TYPES[name] for name in (*_IMAGES, 'odom', 'camera_info')},
+TOPIC_TYPES: Final = {**{name: TYPES[name] for name in (*_IMAGES, 'odom', 'camera_info')},
                DIAGNOSTICS: 'diagnostic_msgs/msg/DiagnosticArray'}
 
 
@@ -90,11 +90,12 @@ class RecordedSystem:
         names = names_there(namespace, {
             **topics_of_camera(chosen.image, chosen.camera_info), **(remaps or {})})
         images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
-        self._read = None if own else OwnMotion(
+        self._own_motion = None if own else OwnMotion(
             OdometrySource(filled(SourceParams(), perception, 'odom_')))
         self.seen = Observations(
             live=False, source=str(bag.path), duration=bag.duration_ns / NANOSECONDS,
-            namespace=namespace, names=names, incomplete=bag.incomplete, own=own or self._read,
+            namespace=namespace, names=names, incomplete=bag.incomplete,
+            own=own or self._own_motion,
             parameters={**values, 'relative_pose': perception,
                         'planner': alone(values['planner'], camera)[1]},
             unreadable=dict(bag.skipped), topics={
@@ -107,7 +108,7 @@ class RecordedSystem:
         if bag.set_back_ns > MAX_GAP * NANOSECONDS:
             self.seen.set_back = bag.set_back_ns / NANOSECONDS
         names[DIAGNOSTICS] = DIAGNOSTICS
-        self.topics = {names[name]: name for name, msgtype in READ.items()
+        self.topics = {names[name]: name for name, msgtype in TOPIC_TYPES.items()
                        if names[name] in self.seen.topics
                        and bag.topics[names[name]].msgtype == msgtype
                        and (name not in _IMAGES or name == self.seen.image_name)}
@@ -146,8 +147,8 @@ class RecordedSystem:
         except ValueError as problem:
             self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
             return None
-        if name == 'odom' and self._read is not None:
-            self._read.take(message, time_ns)
+        if name == 'odom' and self._own_motion is not None:
+            self._own_motion.take(message, time_ns)
         self._collector.take(name, topic, message, time_ns / NANOSECONDS)
         return message
 

@@ -146,7 +146,7 @@ def _check_published(seen: Observations, name: str) -> Finding:
          connect or 'start its driver'),
         (not topic.publishers, ERROR, f'the bag lacks {full}',
          connect or 'record it; evaluate needs it'),
-        (msgtype not in topic.types, ERROR, f'{full} holds {", ".join(topic.types)}',
+        (msgtype not in topic.types, ERROR, f'{full} has type {", ".join(topic.types)}',
          connect or f'have its source send {msgtype}'),
         (not topic.arrivals, ERROR, f'{nodes} publishes {full}, and sends nothing',
          "see the node's log; is the sensor connected, calibrated and initialized?"),

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Alignment of the odometry frame of another vehicle with the own frame, by a Kalman filter.
+Alignment of the odometry frame of another vehicle with the ego frame, by a Kalman filter.
 
 All frames share the vertical, by gravity: a frame has a yaw and a translation, 4 unknowns. The
-state is the yaw, which turns its coordinates to the own ones, and the place of an anchor point in
-the own frame. The anchor moves with the sending vehicle, because the drift of its odometry turns
+state is the yaw, which turns its coordinates to the ego ones, and the place of an anchor point in
+the ego frame. The anchor moves with the sending vehicle, because the drift of its odometry turns
 the frame about the vehicle. So the errors of yaw and place are nearly independent, and the lever
 arm is short.
 
@@ -73,10 +73,10 @@ def yaw_derivative(vector: Array) -> Array:
 @dataclass
 class Frame:
     """
-    Estimate of another vehicle's frame in the own one; ``covariance`` (4, 4) of yaw and place.
+    Estimate of another vehicle's frame in the ego one; ``covariance`` (4, 4) of yaw and place.
 
-    ``yaw``, rad, turns its coordinates to the own ones; ``anchor`` (3,), m, in it is at ``place``
-    (3,), m, in the own frame. ``stamp``, ns: of the newest drift.
+    ``yaw``, rad, turns its coordinates to the ego ones; ``anchor`` (3,), m, in it is at ``place``
+    (3,), m, in the ego frame. ``stamp``, ns: of the newest drift.
     """
 
     yaw: float
@@ -92,17 +92,17 @@ class Frame:
         return math.sqrt(max(variances[1:].sum(), 0.0)), math.sqrt(max(variances[0], 0.0))
 
     def lever(self, position: Array) -> Array:
-        """Return the vector (3,), m, from the anchor to a position, turned to the own frame."""
+        """Return the vector (3,), m, from the anchor to a position, turned to the ego frame."""
         return yaw_rotation(self.yaw).dot(position - self.anchor)
 
     def locate(self, position: Array) -> tuple[Array, Array]:
-        """Return a position in the own frame (3,), and the covariance (3, 3) by this frame."""
+        """Return a position in the ego frame (3,), and the covariance (3, 3) by this frame."""
         lever = self.lever(position)
         H = _jacobian(lever)[:3]
         return self.place + lever, H.dot(self.covariance).dot(H.T)
 
     def point(self, point: TrackPoint) -> TrackPoint:
-        """Return a track point of this frame in the own frame."""
+        """Return a track point of this frame in the ego frame."""
         rotation, (position, share) = yaw_rotation(self.yaw), self.locate(point.position)
         return point._replace(
             position=position, velocity=rotation.dot(point.velocity),
@@ -134,7 +134,7 @@ class Frame:
 
     def relate(self, theirs: TrackPoint, ours: TrackPoint) -> float:
         """
-        Update with the track points of one vehicle in its frame and in the own one, at one stamp.
+        Update with the track points of one vehicle in its frame and in the ego one, at one stamp.
 
         Return their squared Mahalanobis distance divided by the gate's: above 1 it is refused.
         """
@@ -176,7 +176,7 @@ VARIANCE_FACTOR = 4.0  # on the variances of a fit: errors of sightings are corr
 OUTLIER_CHI2 = 25.0  # chi^2 (3 degrees of freedom) above which a pair is excluded from a fit
 MIN_AGREEING_SHARE = 0.7  # share of the pairs that must fit
 Pair = tuple[TrackPoint, TrackPoint]
-"""Track points of one vehicle in another frame and in the own one, at one stamp."""
+"""Track points of one vehicle in another frame and in the ego one, at one stamp."""
 
 
 def first_fit(pairs: Sequence[Pair]) -> Frame | None:
@@ -219,9 +219,9 @@ def _fit(rows: Array, stamp: int) -> Frame:
 def in_own_frame(state: OdometryState, of_itself: bool, frame: Frame,
                  name: str) -> OdometryState:
     """
-    Return a state in an aligned frame as a state in the own frame, at its stamp.
+    Return a state in an aligned frame as a state in the ego frame, at its stamp.
 
-    :param of_itself: whether the vehicle sent it of itself; :param name: of the own frame.
+    :param of_itself: whether the vehicle sent it of itself; :param name: of the ego frame.
     """
     rotation, yaw_variance = yaw_rotation(frame.yaw), float(frame.covariance[0, 0])
     position, share = frame.locate(state.position)

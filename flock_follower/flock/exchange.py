@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Messages between followers: sends the own state and detections, transforms received states.
+Messages between followers: sends the ego state and sightings, transforms received states.
 
 Each follower sends its own state and the vehicles that it sees, in its own odometry frame, and
-never what it received. Received states are transformed into the own frame once the sender's frame
+never what it received. Received states are transformed into the ego frame once the sender's frame
 is aligned; until then they are not used.
 
-The frame of a sender is related to the own frame by a vehicle known in both at one time: the
+The frame of a sender is related to the ego frame by a vehicle known in both at one time: the
 sender seen by this vehicle, this vehicle seen by the sender, or a vehicle that both see. If there
 is none, by a vehicle that another aligned sender reports. Such relations lead away from this
 vehicle: a sender related by n others relates only senders that are related by more.
@@ -71,7 +71,7 @@ STALE_AGE = 500_000_000
 DISORDER = to_nanoseconds(MAX_JUMP)  # ns by which an older state comes after a newer one
 OWN_FUTURE = 'own odometry from the future'
 START_YAW = 0.35  # rad: a linear filter needs a first yaw with at most this deviation
-SEEN_TIMEOUT = 500_000_000  # ns after an own sighting in which received states are not used
+SEEN_TIMEOUT = 500_000_000  # ns after a sighting; received states are not used meanwhile
 FORGOTTEN = 30 * NANOSECONDS  # ns: a sender silent for so long is forgotten
 MAX_SENDERS = 32  # senders
 MAX_VEHICLES = 40  # vehicles that one vehicle sees, or reports
@@ -114,7 +114,7 @@ class Sharing:
     # In.
 
     def take_own(self, state: OdometryState) -> None:
-        """Take the own state, of any odometry."""
+        """Take the ego state, of any odometry."""
         self._settle()
         fast, before = too_fast(state), self._own
         if self._refuse_first((fast, 'own odometry not finite, or too fast', fast)):
@@ -135,7 +135,7 @@ class Sharing:
         self._tracks[self.name].add(track_point(state, True))
 
     def take_seen(self, state: OdometryState) -> None:
-        """Take an own sighting of another vehicle, as on ``neighbors``."""
+        """Take a sighting of another vehicle by this one, as on ``neighbors``."""
         self._settle()
         name, before, fast = state.child, self._seen.get(state.child), too_fast(state)
         frame = None if self._own is None else self._own.frame
@@ -181,7 +181,7 @@ class Sharing:
     def _process(self, state: OdometryState, received: int) -> None:
         name = sender_of(state.frame)
         sender = self._senders.get(name)
-        # An own message may come back.
+        # The network may return a message of this vehicle.
         if self._refuse_first(
                 (not name, 'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
                  f'NAME{FRAME}, where NAME is the sending vehicle'),
@@ -313,7 +313,7 @@ class Sharing:
     # Out.
 
     def messages(self, now: int) -> list[OdometryState]:
-        """Return the messages to send: the own state and sightings, each once, at most 10 Hz."""
+        """Return the messages to send: the ego state and sightings, each once, at most 10 Hz."""
         own, name = self._own, self.name
         if own is None or now - own.stamp > STALE_AGE or (
                 self._last_round is not None and 0 <= now - self._last_round < PERIOD):
@@ -333,7 +333,7 @@ class Sharing:
 
     def neighbors(self, now: int) -> list[OdometryState]:
         """
-        Return the received vehicles that are not seen, in the own frame, one state per vehicle.
+        Return the received vehicles that are not seen, in the ego frame, one state per vehicle.
 
         Each has the stamp of its state; the covariances are those of its prediction to ``now``. If
         several states of one vehicle are known, the most certain one is used: their errors may be

@@ -71,8 +71,8 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     agent. Any other neighbor only separates, with f0 psi. The pull of an edge, infinite from d1
     on, is at most ``most``, so that an edge longer than the band does not mask the others.
 
-    :param offsets: the neighbors' positions minus the own one (m, n), m.
-    :param differences: their velocities minus the own one (m, n), m/s.
+    :param offsets: the neighbors' positions minus the ego one (m, n), m.
+    :param differences: their velocities minus the ego one (m, n), m/s.
     :param share: (m,) 1 along an edge, 0 without one, in between while an edge changes.
     :param others: (m,) not part of the flock: separation with the L of the pair.
     :param most: largest pull of one neighbor, m/s^2.

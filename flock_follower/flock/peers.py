@@ -37,7 +37,7 @@ NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
 FRAME = '/odom'
 
 MESSAGE_AGE_MAX = 1.0  # s up to which a received state is accepted and given out
-CLOCK_TOLERANCE = 0.02  # s by which a message may be ahead of the own clock
+CLOCK_TOLERANCE = 0.02  # s by which a message may be ahead of the ego clock
 ODOMETRY_NOISE = 0.02  # m: noise of a position from odometry
 OWN_YAW_NOISE = 0.02  # rad: likewise of its yaw
 SIGHTING_NOISE = 0.02  # m: slowly varying error of a sighting beyond its covariance

@@ -46,7 +46,7 @@ class Sender:
     frame: Frame | None = None
     """Estimate of its frame; None while it is not known."""
     hops: float = math.inf
-    """1 if its frame is related to the own one directly, 2 by one other sender, ..."""
+    """1 if its frame is related to the ego one directly, 2 by one other sender, ..."""
     pairs: deque[Pair] = field(default_factory=lambda: deque(maxlen=MAX_PAIRS))
     """Relations until the first fit."""
     yaw_std: float = math.pi

@@ -47,11 +47,11 @@ from flock_follower.ranges import (
     V_MAX,
 )
 
-#: Where no limit is set, velocities disagree that differ by this share of v_max.
-DISAGREEMENT_SHARE: Final[float] = 0.5
-#: They differ by this at least, m/s: the healthy estimate of PX4 1.16 (SIH, odometry forwarded)
+#: Tolerance of the difference between two velocities, as a share of v_max, if no limit is set.
+VELOCITY_TOLERANCE_SHARE: Final[float] = 0.5
+#: The tolerance is at least this, m/s: the healthy estimate of PX4 1.16 (SIH, odometry forwarded)
 #: errs by up to 0.25, averaged.
-DISAGREEMENT_LEAST: Final[float] = 0.4
+MIN_VELOCITY_TOLERANCE: Final[float] = 0.4
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ class GateLimits(Checked):
     @property
     def velocity_tolerance(self) -> float:
         """Return the largest difference between the velocities of odom and autopilot, m/s."""
-        return self.velocity_disagreement or max(DISAGREEMENT_SHARE * self.v_max,
-                                                 DISAGREEMENT_LEAST)
+        return self.velocity_disagreement or max(VELOCITY_TOLERANCE_SHARE * self.v_max,
+                                                 MIN_VELOCITY_TOLERANCE)
 
 
 #: The share of ``a_max`` that a stop at a bound is planned with: the rest is for errors of thrust.

@@ -148,7 +148,7 @@ class FlightEnd:
 
     def begin(self) -> None:
         """Reset after a request of an operator."""
-        self.handover, self._held_since = NO_HANDOVER, math.inf
+        self.handover, self._held_since, self._asked = NO_HANDOVER, math.inf, -math.inf
 
     @property
     def why(self) -> str:

@@ -105,7 +105,8 @@ class MotionSources:
             time = now - max(age, 0.0)
             known.take_velocity(v, time)
             known.take_yaw(report.yaw, time)
-            known.take_position(report.position, time, report.std, max_age)
+            known.take_position(report.position, time, report.std, max_age, (
+                self._sources[AUTOPILOT].path if source == ODOM else None))
             now_at = self.position
             if by != self.source and before is not None and now_at is not None:
                 # Odometry takes over, in a frame of its own: the vehicle has not moved by that.

@@ -115,7 +115,7 @@ class Permission:
     cause: Cause | None = Cause.NOT_REQUESTED
     """The same for code; None if it is ACTIVE."""
     taker: Taker = UNKNOWN
-    """While TAKEN_OVER, who has changed the mode."""
+    """While TAKEN_OVER, who has changed the mode; after a stick moved, STICK until a request."""
     left_for: str = ''
     """While TAKEN_OVER, the mode that was flown instead."""
 
@@ -131,12 +131,10 @@ class Permission:
 
     def taken_over(self, now: float) -> str:
         """Return the refusal if a pilot took over too shortly before ``now``, s, or ''."""
-        stick = self.cause is Cause.STICK
-        taken = self.phase is Phase.TAKEN_OVER or stick
+        taken = self.phase is Phase.TAKEN_OVER or self.taker == STICK
         if not taken or not self.taker.pilot or now - self.received >= TAKEOVER_TIME:
             return ''
-        unknown = self.taker == UNKNOWN and not stick
-        who = 'the pilot, or a failsafe,' if unknown else 'the pilot'
+        who = 'the pilot, or a failsafe,' if self.taker == UNKNOWN else 'the pilot'
         return (f'{who} took over {max(now - self.received, 0.0):.0f} s ago: refused for '
                 f'{TAKEOVER_TIME:g} s; hold and land stay available')
 
@@ -164,7 +162,14 @@ class Permission:
         return self._giving_back(why, cause) if self.streams else self
 
     def _giving_back(self, why: str, cause: Cause) -> Permission:
-        return replace(self, phase=Phase.GIVING_BACK, reason=why, cause=cause)
+        # Another request does not undo a takeover, or that one may have gone unseen.
+        unseen = self.phase is Phase.GIVING_BACK and self.cause is Cause.MODE_UNKNOWN
+        return replace(self, phase=Phase.GIVING_BACK, reason=why, cause=self.cause if (
+            unseen) else cause, taker=STICK if cause is Cause.STICK else self.taker)
+
+    def _end_sending(self, why: str, cause: Cause) -> Permission:
+        """Return the permission that sends nothing; a stick that was moved still counts."""
+        return Permission(reason=why, received=self.received, cause=cause, taker=self.taker)
 
     def contest(self, who: str) -> Permission:
         """Brake, because two nodes give commands at once."""
@@ -174,8 +179,7 @@ class Permission:
     def fall_silent(self, why: str) -> Permission:
         """Stop sending, as no velocity is valid: only silence starts the failsafe."""
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
-        return Permission(
-            reason=f'fell silent: {why}', cause=Cause.SILENT) if self.streams else self
+        return self._end_sending(f'fell silent: {why}', Cause.SILENT) if self.streams else self
 
     def follow_silence(self, silence: float) -> Permission:
         """Brake until offboard is requested, after a time, s, without a report of the mode."""
@@ -186,7 +190,7 @@ class Permission:
 
     def land(self) -> Permission:
         """End a flight after a landing."""
-        return Permission(reason=ON_GROUND, cause=Cause.LANDED) if self.streams else self
+        return self._end_sending(ON_GROUND, Cause.LANDED) if self.streams else self
 
     def reset(self, why: str) -> Permission:
         """Reset: the autopilot, rebooted or replaced, has not received the request."""
@@ -219,11 +223,9 @@ class Permission:
         if now.phase is Phase.GIVING_BACK:
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
-            if status.armed and now.cause is Cause.STICK:
-                return now.leave_mode(status, STICK)
-            if status.armed and now.cause is Cause.MODE_UNKNOWN:
-                return now.leave_mode(status)
-            return Permission(reason=f'given back ({now.reason})', cause=Cause.GIVEN_BACK)
+            if status.armed and (now.taker == STICK or now.cause is Cause.MODE_UNKNOWN):
+                return now.leave_mode(status, now.taker)
+            return now._end_sending(f'given back ({now.reason})', Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):
             return _end_on_ground(status)
         if not status.offboard:

@@ -255,7 +255,7 @@ class VelocityComparison:
 #: Displacements are compared over this time, s.
 DISPLACEMENT_WINDOW: Final[float] = 5.0
 #: Displacements may differ by this, m, or by 3 standard deviations if those are more.
-TOLERANCE: Final[float] = 0.5
+DISPLACEMENT_TOLERANCE: Final[float] = 0.5
 #: Odometry that reports a larger standard deviation of its position, m, counts with this one: the
 #: drift since the start grows without limit, and that of a few seconds does not.
 ODOMETRY_STD_MAX: Final[float] = 0.5
@@ -289,11 +289,13 @@ class Path:
         self._shift: Array | float = 0.0
         self._kept: deque[tuple[float, Array]] = deque()
 
-    def take(self, position: Array, velocity: Array | None, now: float) -> None:
+    def take(self, position: Array, velocity: Array | None, now: float,
+             other: Path | None = None) -> None:
         """
         Take a position, m.
 
         :param velocity: (3,), m/s, by the same source; None: jumps are not detected.
+        :param other: of another source, which shows the motion in a gap of this one.
         """
         elapsed = now - self._time
         if elapsed <= 0.0:
@@ -303,7 +305,12 @@ class Path:
         shifted = position - self._shift
         if self.position is not None and velocity is not None:
             surprise = shifted - self.position - velocity * elapsed
-            if math.hypot(*surprise.tolist()) > self._largest_surprise(velocity, elapsed):
+            largest = self._largest_surprise(velocity, elapsed)
+            if elapsed > PATH_GAP and other is not None and other.covers(self._time, now):
+                surprise = shifted - self.position - other.displacement(
+                    self._time, min(now, other.span[1]))
+                largest = DISPLACEMENT_TOLERANCE
+            if math.hypot(*surprise.tolist()) > largest:
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
         self.position, self._time, self._velocity = shifted, now, velocity
@@ -325,6 +332,11 @@ class Path:
     def span(self) -> tuple[float, float]:
         """Return the times, s, between which the path is known."""
         return (self._kept[0][0], self._kept[-1][0]) if self._kept else (math.inf, -math.inf)
+
+    def covers(self, start: float, end: float) -> bool:
+        """Return whether the path is known between two times, s, except for a last PATH_GAP."""
+        first, last = self.span
+        return first <= start and end - last <= PATH_GAP
 
     def displacement(self, start: float, end: float) -> Array:
         """Return the displacement (3,), m, from one time within the span to another."""
@@ -383,17 +395,18 @@ class Source:
             self.velocity, self.velocity_time = velocity, time
 
     def take_position(self, position: ArrayLike | None, time: float, std: float,
-                      max_age: float) -> None:
+                      max_age: float, other: Path | None = None) -> None:
         """
         Take a position (3,), m, at a time, s, with a standard deviation, m.
 
         :param max_age: of the velocity that the position is compared with, s.
+        :param other: see ``Path.take``.
         """
         p = finite_vector(position)
         if p is not None and max(map(abs, p.tolist())) < SANE:
             fresh = time - self.velocity_time <= max_age
             self.position = p
-            self.path.take(p, self.velocity if fresh else None, time)
+            self.path.take(p, self.velocity if fresh else None, time, other)
             self.std = std if math.isfinite(std) else 0.0
 
     def take_yaw(self, yaw: float, time: float) -> None:
@@ -444,6 +457,6 @@ def find_displacement(odom: Source, autopilot: Source | None, turn: float, heigh
 def _too_far(error: Array, std: float, other: str) -> Refusal | None:
     """Return the difference if it exceeds the limit for a standard deviation, both m, or None."""
     distance = math.sqrt(error.dot(error))
-    return None if not distance > max(TOLERANCE, 3.0 * std) else Refusal(
+    return None if not distance > max(DISPLACEMENT_TOLERANCE, 3.0 * std) else Refusal(
         Obstacle.DISPLACED, f'displacements of odom and of the {other} differ by '
         f'{distance:.1f} m in {DISPLACEMENT_WINDOW:g} s')

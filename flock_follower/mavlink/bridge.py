@@ -80,7 +80,7 @@ class Bridge:
 
     :param forwarder: if given, its odometry is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
-    :param require_failsafe: whether offboard requires the ``rules`` of the dialect.
+    :param require_failsafe: whether offboard requires the ``offboard_rules`` of the dialect.
     :param recommendations: this, ``estimate_rate`` and ``origin`` are those of ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
     :param end: conditions under which the bridge itself ends a flight.
@@ -312,7 +312,7 @@ class Bridge:
         end = self.end.reason(
             self.gate.active_since, self.gate.commands.received,
             self.gate.handover(now) if flies else '', now)
-        if moved := self.sticks.moved and self.housekeeping.watches_sticks():
+        if moved := self.sticks.has_moved and self.housekeeping.watches_sticks():
             end = Handover(STICK.text, cause=Cause.STICK)
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:
@@ -352,16 +352,19 @@ class Bridge:
         """
         Send the final messages.
 
-        A vehicle that still flies our setpoints receives a hold command, or the land command again
-        if a landing is pending; none while its mode is unknown. The last message is a level
-        setpoint, because autopilots obey it for up to seconds: after that time a braking one would
-        make the vehicle fly backwards.
+        A vehicle that still flies our setpoints receives a hold command, or again the one by which
+        a pending request ends the flight: a landing, or the pilot's mode after a stick was moved;
+        none while its mode is unknown. The last message is a level setpoint, because autopilots
+        obey it for up to seconds: after that time a braking one would make the vehicle fly
+        backwards.
         """
         # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (
                 self.status(now) is not None):
-            make = commands.land if self.requests.landing else commands.hold
-            goal = make(self.telemetry.dialect)
+            pending = self.requests.pending
+            ends = pending is not None and pending.goal.ends_flight and pending.current.modes
+            goal = pending.current if pending is not None and ends else (
+                commands.hold(self.telemetry.dialect))
             self.link.send_command(goal.command, goal.params)
         setpoint, _ = self._decide(now)
         if setpoint.kind != NONE:

@@ -139,13 +139,13 @@ class Dialect:
     """Whether the origin is sent with its height; the heights of PX4 would jump by it."""
     recommendations: str
     """File of recommended parameters in ``config/``."""
-    rules: tuple[Rule, ...]
+    offboard_rules: tuple[Rule, ...]
     """The parameters that forbid offboard."""
     versions: tuple[tuple[int, int], tuple[int, int]]
     """The oldest and the newest firmware, major and minor, for which both are known."""
     watched: tuple[str, ...]
-    """Parameters of failsafe, frame and height that, besides those of ``rules``, may not change in
-    flight."""
+    """Parameters of failsafe, frame and height that may not change in flight, besides those of
+    ``offboard_rules``."""
     hover_thrust: str
     """Parameter of the hover thrust."""
     mode_message: int
@@ -238,7 +238,7 @@ PX4: Final[Dialect] = Dialect(
     # vision is gone, the first only after 5 s.
     velocity_flags=(mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, 0),
     gps_switch='EKF2_GPS_CTRL', origin_has_height=False, recommendations='px4.params',
-    versions=((1, 14), (1, 18)), rules=(
+    versions=((1, 14), (1, 18)), offboard_rules=(
         Rule('COM_OF_LOSS_T', lambda value: value > LONGEST, _TOO_LONG),
         Rule('COM_OBL_RC_ACT', lambda value: value in (6, 7),
              ': it would stop its motors in the air (6: terminate, 7: disarm) if the bridge died; '
@@ -277,7 +277,7 @@ ARDUPILOT: Final[Dialect] = Dialect(
     velocity_flags=(mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE),
     gps_switch='',  # an origin of zeros makes its firmware panic
     origin_has_height=True, recommendations='ardupilot.parm',
-    versions=((4, 6), (4, 7)), rules=(
+    versions=((4, 6), (4, 7)), offboard_rules=(
         Rule('GUID_TIMEOUT', lambda value: value > LONGEST, _TOO_LONG),
         Rule('VISO_TYPE', lambda value: value == 0, f'{_NOT_FUSED}set it to 1 (MAVLink)',
              forwarding=True),

@@ -41,7 +41,7 @@ from flock_follower.mavlink.estimator_health import REPORT_WINDOW
 from flock_follower.mavlink.global_origin import GlobalOrigin
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.link_questions import NO_ANSWER, REASONS
-from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
+from flock_follower.mavlink.parameter_check import applicable_rules, ParameterCheck, Recommendation
 from flock_follower.mavlink.parameter_watch import ParameterWatch
 from flock_follower.mavlink.sticks import needs_stick_handover
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
@@ -261,7 +261,7 @@ class Housekeeping:
         switch = dialect.gps_switch if self.without_gps else ''
         return ParameterCheck(
             self._recommendations.get(dialect.name, ()), dialect,
-            needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
+            needed=[*(rule.name for rule in applicable_rules(dialect, self.without_gps)),
                     *filter(None, (dialect.minimum_takeoff, switch))])
 
     def unreceived_reason(self, now: float) -> str:

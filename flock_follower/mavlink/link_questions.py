@@ -106,7 +106,7 @@ class LinkQuestions:
         if kind == 'TIMESYNC':
             name = TIMESYNC if message.tc1 and message.ts1 in self._times else ''
         elif kind in ('PARAM_VALUE', 'PARAM_ERROR'):
-            name = parameter(message.param_id)
+            name = parameter_question(message.param_id)
         elif kind == 'COMMAND_ACK' and self.is_addressed(message):
             self._any.answer(now)
             # A rate that is refused is an answer, too; a refusal names no reasons.
@@ -141,7 +141,7 @@ class LinkQuestions:
             self._times.append(message.ts1)
             return [TIMESYNC]
         if kind == 'PARAM_REQUEST_READ':
-            return [parameter(message.param_id)]
+            return [parameter_question(message.param_id)]
         if kind == 'SET_GPS_GLOBAL_ORIGIN':
             return ['GPS_GLOBAL_ORIGIN']
         if kind != 'COMMAND_LONG':
@@ -158,7 +158,7 @@ class LinkQuestions:
             (ack.target_system, ack.target_component), self._source))
 
 
-def parameter(name: str | bytes) -> str:
+def parameter_question(name: str | bytes) -> str:
     """Return the question for the value of a parameter."""
     text = name.decode('ascii', 'replace') if isinstance(name, bytes) else name
     return 'parameter ' + text.rstrip('\0')

@@ -138,12 +138,12 @@ def has_jumped(before: OdometryState, then: float, after: OdometryState, now: fl
     """
     dt = now - then
     mean_velocity = 0.5 * (before.velocity + after.velocity)
-    moved = after.position - before.position - mean_velocity * dt
-    turned = quaternion_to_rotation_vector(
+    position_error = after.position - before.position - mean_velocity * dt
+    attitude_error = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
-    turned = turned - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
-    return bool(dt < 0.0 or np.linalg.norm(moved) > POSITION_JUMP
-                or np.linalg.norm(turned) > ATTITUDE_JUMP)
+    attitude_error = attitude_error - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
+    return bool(dt < 0.0 or np.linalg.norm(position_error) > POSITION_JUMP
+                or np.linalg.norm(attitude_error) > ATTITUDE_JUMP)
 
 
 def quality(state: OdometryState, age: float) -> int:

@@ -225,7 +225,7 @@ class ParameterCheck:
         """Return the names to read repeatedly: answered before, and part of a rule."""
         if self._dialect is None:
             return []
-        kept = {*self._dialect.watched, *(rule.name for rule in self._dialect.rules)}
+        kept = {*self._dialect.watched, *(rule.name for rule in self._dialect.offboard_rules)}
         return [name for name in self.values if name in kept]
 
     def is_known(self, name: str) -> bool:
@@ -298,14 +298,14 @@ _ANYWAY: Final[str] = 'require_failsafe:=false'
 ASK: Final[str] = 'does the autopilot receive our messages? read them in the ground station'
 
 
-def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
+def applicable_rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
     """Return the rules that apply; ``forwarding`` is whether odometry is forwarded."""
-    return [rule for rule in dialect.rules if forwarding or not rule.forwarding]
+    return [rule for rule in dialect.offboard_rules if forwarding or not rule.forwarding]
 
 
 def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return the reason in the autopilot's parameters against flying by setpoints, or ''."""
-    values, applicable = parameters.values, rules(dialect, forwarding)
+    values, applicable = parameters.values, applicable_rules(dialect, forwarding)
     for rule in applicable:
         if rule.name in values and rule.forbidden(values[rule.name]):
             return f'{rule.name} = {values[rule.name]:g}{rule.advice} (or {_ANYWAY})'

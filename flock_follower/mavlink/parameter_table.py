@@ -33,7 +33,7 @@ from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.ranges import Range
 from flock_follower.settings import refuse
 
-ORIGIN = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
+ORIGIN_RANGES = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
           'height': Range(-10_000.0, 10_000.0, 'm')}
 MAVLINK_BRIDGE = [
     Spec('connection', 'udpin:127.0.0.1:14540',
@@ -110,7 +110,7 @@ def origin(values: list[float]) -> tuple[float, float, float] | None:
     """
     if not any(values):
         return None
-    for (name, valid), value in zip(ORIGIN.items(), values):
+    for (name, valid), value in zip(ORIGIN_RANGES.items(), values):
         valid.check(f'global_origin = {values}: {name}', value)
     latitude, longitude, height = values
     return latitude, longitude, height

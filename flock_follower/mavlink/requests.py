@@ -57,7 +57,7 @@ class Requests:
     Begins requests and steps the one whose outcome is open.
 
     :param end: end of the flight; reset by a request of an operator.
-    :param require_failsafe: whether offboard requires the ``rules`` of the dialect.
+    :param require_failsafe: whether offboard requires the ``offboard_rules`` of the dialect.
     """
 
     def __init__(self, link: Link, gate: Gate, housekeeping: Housekeeping,

@@ -93,7 +93,7 @@ class StickWatch:
     """
 
     def __init__(self, threshold: float) -> None:
-        self.moved = False
+        self.has_moved = False
         """Whether a stick has moved since ``begin``."""
         self._threshold = threshold
         self._kind = KINDS[1]
@@ -104,7 +104,7 @@ class StickWatch:
 
     def begin(self, now: float) -> None:
         """Take the positions at ``now``, or those received next, as the rest positions."""
-        self.moved = False
+        self.has_moved = False
         self._rest = self._newest if now - self._time <= STICK_GAP else None
         self._counts = dict.fromkeys(self._counts, 0)
 
@@ -144,4 +144,4 @@ class StickWatch:
                            ('throttle back', away and abs(sticks.throttle) <= CENTER)):
             counts[name] = counts[name] + 1 if true else 0
         back = min(counts['throttle away'], counts['throttle back'])
-        self.moved |= max(counts['stick'], back) >= MOVED_MESSAGES
+        self.has_moved |= max(counts['stick'], back) >= MOVED_MESSAGES

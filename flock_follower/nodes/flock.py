@@ -16,8 +16,8 @@
 The flock node: followers exchange their own states and the states of the neighbors they see.
 
 Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share. Publishes
-on the latter, at 10 Hz, the own state and the neighbors in sight, and on ``neighbors/heard`` the
-neighbors that others reported and that are out of sight, in the own odometry frame. The
+on the latter, at 10 Hz, the ego state and the neighbors in sight, and on ``neighbors/heard`` the
+neighbors that others reported and that are out of sight, in the ego odometry frame. The
 mathematics is in ``flock_follower.flock``.
 """
 

@@ -229,7 +229,7 @@ class MavlinkBridge(FlockNode):
         # Never in the future, if the clock was set.
         now = time.monotonic() - max((self._even_clock.now() - arrival) * 1e-9, 0.0)
         self._odom_frame = state.frame
-        self._report.place = state, now
+        self._report.take_odometry(state, now)
         self._new_odom.append((state, stamp_age(state.stamp, arrival), now))
 
     def _hand_over_odom(self) -> None:

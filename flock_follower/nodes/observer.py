@@ -110,7 +110,7 @@ class Observer(Node):
         """
         executor = SingleThreadedExecutor()
         executor.add_node(self)
-        ours = [os.getpid(), *(process for process, *_ in processes((*OURS, *SIMULATOR)))]
+        ours = [os.getpid(), *(process for process, *_ in find_processes((*OURS, *SIMULATOR)))]
         meter, end = LoadMeter(lambda: ours), self._begin + self._seconds
         try:
             while rclpy.ok() and (now := time.monotonic()) < end:
@@ -227,7 +227,7 @@ class Observer(Node):
                 del seen.topics[topic]
 
 
-def processes(names: Collection[str] = OURS) -> Iterator[tuple[int, str, dict[str, str]]]:
+def find_processes(names: Collection[str] = OURS) -> Iterator[tuple[int, str, dict[str, str]]]:
     """Yield id, name and environment of our nodes on this computer, but not of other users'."""
     for folder in Path('/proc').glob('[0-9]*'):
         with suppress(OSError):  # ended meanwhile, or of another user
@@ -256,7 +256,7 @@ def _machine(load: Load | None) -> Machine:
 def _find_reach() -> list[tuple[str, Reach | None]]:
     """Return from where our nodes on this computer are reached; if it sees none, ``check``."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    ours = [(node, process) for process, node, environment in processes()
+    ours = [(node, process) for process, node, environment in find_processes()
             if environment.get('ROS_DOMAIN_ID', '0') == domain]
     return [(node, find_reach(process, int(domain)))
             for node, process in ours or [('check', os.getpid())]]

@@ -168,10 +168,10 @@ class Planner(FlockNode):
         self._loop.take_odometry(state, arrival)
 
     def _take_motion(self, message: Odometry, arrival: int) -> None:
-        shift = self._even_clock.shift
+        clock_shift = self._even_clock.clock_shift
         if self._even_clock.fresh(MOTION_TOPIC, stamp_to_nanoseconds(message.header.stamp)):
             state = from_odometry(message)
-            self._take_odom(state._replace(stamp=state.stamp - shift), arrival - shift)
+            self._take_odom(state._replace(stamp=state.stamp - clock_shift), arrival - clock_shift)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -193,14 +193,15 @@ class Planner(FlockNode):
             self._loop.take_camera_info(message, values.rpy, camera, values.rectified)
 
     def _take_armed_at(self, message: PointStamped) -> None:
-        if math.isfinite(message.point.z):
-            self._loop.ground = message.point.z
-            self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
+        known = math.isfinite(message.point.z)
+        self._loop.ground = message.point.z if known else None
+        self.get_logger().info(f'armed at a height of {message.point.z:.2f} m' if known else (
+            'the height at arming is unknown'))
 
     def _take_frame(self, message: Header, arrival: int) -> None:
         # Compared with the stamps of neighbors: on the same clock.
         stamp = self._even_clock.dated(stamp_to_nanoseconds(message.stamp), arrival)
-        if self._loop.take_frame(arrival - self._even_clock.shift, stamp):
+        if self._loop.take_frame(arrival - self._even_clock.clock_shift, stamp):
             timeout = round(self._settings.current.perception_timeout * 1e9)
             late = self.get_clock().now().nanoseconds - arrival
             # Within the timeout, if the clock was set meanwhile.
@@ -248,10 +249,10 @@ class Planner(FlockNode):
             nanoseconds, self._settings.current, self._bridge_age())
         if command is not None:
             self._commands.publish(trajectory(
-                make, command._replace(stamp=command.stamp + self._even_clock.shift)))
+                make, command._replace(stamp=command.stamp + self._even_clock.clock_shift)))
             self.diagnostics.rate('command').tick(self._ticked)
         if (known := self._loop.distance()) is not None:
-            stamp = nanoseconds_to_stamp(nanoseconds + self._even_clock.shift)
+            stamp = nanoseconds_to_stamp(nanoseconds + self._even_clock.clock_shift)
             self._distances.publish(Range(
                 header=Header(frame_id=known[0], stamp=stamp), range=known[1]))
         self._report(decision)

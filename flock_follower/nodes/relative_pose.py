@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The perception node: images and own odometry in, the neighbors' states out.
+The perception node: images and ego odometry in, the neighbors' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``), or the poses of other detectors

@@ -36,7 +36,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import String
@@ -63,7 +62,7 @@ from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, Static
 from flock_follower.nodes.support.output import never_block_output
 from flock_follower.nodes.support.process import run, spin
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import FlockNode, READERS, Waiting
+from flock_follower.nodes.support.runtime import deserialize, FlockNode, READERS, Waiting
 from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.cameras import cameras, CameraValues
@@ -165,7 +164,7 @@ class View(FlockNode):
                 return
             read = READERS.get(kind)
             try:
-                take(deserialize_message(data, kind) if read is None else read(data))
+                take(deserialize(kind, data) if read is None else read(data))
             except ValueError as error:
                 self.diagnostics.reject(f'invalid {topic}', str(error))
 
@@ -270,7 +269,8 @@ class View(FlockNode):
         self._camera, self._transport = camera, transport
         self._source = OdometrySource(source)
         self._mounting = camera_mounting(camera.position, camera.rpy)
-        self._placed_child = any(source.child_position) or any(source.child_rpy)
+        self._static.forget()
+        self._child_configured = any(source.child_position) or any(source.child_rpy)
         self._calibration, self._model = b'', None
 
     def _take_calibration(self, message: CameraInfo) -> None:
@@ -283,7 +283,7 @@ class View(FlockNode):
     def _send_picture(self, data: bytes, kind: Any) -> None:
         """Draw the estimates at an image's stamp into the image."""
         try:
-            message = deserialize_message(data, kind)
+            message = deserialize(kind, data)
             stamp = stamp_to_nanoseconds(message.header.stamp)
             self._server.send_image(draw_picture(
                 decode_image(message), self._model, self._place(stamp),
@@ -300,17 +300,15 @@ class View(FlockNode):
         return pose(sample) @ self._mounting if isinstance(sample, OdometrySample) else None
 
     def _take_odometry(self, message: Odometry) -> None:
-        if not self._placed_child and (
-                child := self._static.transform(message.child_frame_id)) is not None:
-            self._placed_child = True
-            self._source.place_child(child)
+        if not self._child_configured:
+            self._static.place(self._source, message.child_frame_id)
         state = self._source.take(message, self.get_clock().now().nanoseconds)
         self._source.new_events()  # relative_pose reports them
         if state is not None:
             self._use(state)
 
     def _use(self, state: OdometryState) -> None:
-        """Take the own state."""
+        """Take the ego state."""
         if not self._flight.take_odometry(state, time.monotonic()):
             return
         self._epoch = self._epoch or state.stamp

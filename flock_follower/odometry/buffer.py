@@ -57,7 +57,7 @@ _ONES_3 = np.ones(3)
 
 class OdometrySample(NamedTuple):
     """
-    The own state at a stamp, s.
+    The ego state at a stamp, s.
 
     ``position`` (3,), m, and ``velocity`` (3,), m/s, in odom; ``quaternion`` (x, y, z, w) takes
     the body (FLU) to odom; ``angular_velocity`` (3,), rad/s, is in the body. ``travel`` (3,), m,
@@ -180,14 +180,14 @@ class OdometryBuffer:
         last = self._rows[-1]
         dt = sample.stamp - float(last[0])
         mean = 0.5 * (last[_VELOCITY] + sample.velocity)
-        moved: Array = sample.position - last[_POSITION]
+        displacement: Array = sample.position - last[_POSITION]
         # Velocities so far apart are of little use, and an absurd one would stay in the sum.
         # The norm is the faster test, and enough for most.
         if dt > self.MAX_GAP or not (mean.dot(mean) <= FASTEST**2 or (
                 float(np.abs(mean).max()) <= FASTEST)):
-            return last[_TRAVEL] + moved
-        if sample.derived and float(np.abs(moved - dt * mean).max()) < self.STEP:
-            return last[_TRAVEL] + moved
+            return last[_TRAVEL] + displacement
+        if sample.derived and float(np.abs(displacement - dt * mean).max()) < self.STEP:
+            return last[_TRAVEL] + displacement
         return last[_TRAVEL] + dt * mean
 
     def at(self, stamp: float, extrapolate: bool = True) -> OdometrySample | Missing:

@@ -102,8 +102,8 @@ class SourceParams(Checked):
         'roll, pitch, yaw of the child frame of odom on base_link', live=False)
     twist_frame: str = parameter(
         AUTO, CHOICES,
-        'frame of the velocity in odom: child as in REP-105, or odom; none: derive the velocity '
-        'from the positions; auto: detect the frame', live=False)
+        'frame of the velocity in odom. child: child_frame_id (REP-105); odom: frame_id; none: '
+        'derive the velocity from the positions; auto: detect the frame', live=False)
     std: tuple[float, ...] = parameter(
         ODOMETRY_STD, Range(0.0, 100.0, above=True),
         'standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, '
@@ -115,7 +115,7 @@ _NO_LEVER: Array = np.zeros(3)
 
 class OdometrySource:
     """
-    The own odometry, message by message.
+    The ego odometry, message by message.
 
     ``twist`` describes the frame of the velocity.
     ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
@@ -172,19 +172,19 @@ class OdometrySource:
         events, self.events = self.events, []
         return events
 
-    def take(self, message: Any, now: int, shift: int = 0) -> OdometryState | None:
+    def take(self, message: Any, now: int, clock_shift: int = 0) -> OdometryState | None:
         """
-        Return the own state, of base_link, from an Odometry message that arrived at ``now``, ns.
+        Return the ego state, of base_link, from an Odometry message that arrived at ``now``, ns.
 
         None if it is a repetition or out of order. A zero stamp means now.
 
-        :param shift: by how much its stamp is ahead of the clock of ``now``, ns: see
+        :param clock_shift: by how much its stamp is ahead of the clock of ``now``, ns: see
             ``nodes.support.clock_watch``.
 
         :raises ValueError: if position, attitude or stamp is invalid.
         """
         position, attitude = _pose(message)
-        stamp = (read_stamp(message.header.stamp) or now + shift) - shift
+        stamp = (read_stamp(message.header.stamp) or now + clock_shift) - clock_shift
         if not self._is_new(stamp, (message.header.frame_id, message.child_frame_id)):
             return None
         time = (stamp - self._epoch) / NANOSECONDS
@@ -282,9 +282,9 @@ class OdometrySource:
         """Return the covariances (6, 6) of pose and twist as messages have them, of base_link."""
         pose = self._complete_covariance('pose', message.pose.covariance, self._std[:2])
         if self._levers:
-            moved = np.eye(6)
-            moved[:3, 3:] = -skew(lever)
-            pose = moved.dot(pose).dot(moved.T)
+            lever_matrix = np.eye(6)
+            lever_matrix[:3, 3:] = -skew(lever)
+            pose = lever_matrix.dot(pose).dot(lever_matrix.T)
         twist = self._complete_covariance('twist', message.twist.covariance, self._std[2:])
         if self._reading == ODOM or not self._is_base:
             to_base = self._R_child_base.T

@@ -36,8 +36,8 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import (
+    apply_step,
     Lines,
-    moved,
     normal_covariance,
     profiles_across,
     project,
@@ -310,8 +310,8 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         turn = math.inf if step is None else max(map(abs, step.step[3:6].tolist()))
         if step is None or not turn < MAX_TURN_STEP:
             return None
-        pose = moved(pose, lines.center, step.step)
-        lines, bloom = lines.moved(step.step, step.explained), step.step[6:]
+        pose = apply_step(pose, lines.center, step.step)
+        lines, bloom = lines.after_step(step.step, step.explained), step.step[6:]
         blur = [math.sqrt(max(width**2 - (_KERNEL_SIGMA * each)**2, 0.0))
                 for width, each in zip(widths, spacing)]
         suited = _match_spacing(lines, blur)

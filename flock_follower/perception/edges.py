@@ -84,7 +84,7 @@ def normal_covariance(information: Array) -> Array | None:
     return symmetric
 
 
-def moved(pose: Transform, center: Array, step: Array) -> Transform:
+def apply_step(pose: Transform, center: Array, step: Array) -> Transform:
     """Return a pose after a step (6,) or longer: translation of a point, and rotation about it."""
     turn = rotation_vector_to_matrix(step[3:6])
     return Transform(turn.dot(pose.rotation),
@@ -115,7 +115,7 @@ class Lines(NamedTuple):
         (across_x, across_y), (x, y) = self.model.narrowest, self.scale
         return across_x * x, across_y * y
 
-    def moved(self, step: Array, by_step: Array) -> Lines:
+    def after_step(self, step: Array, by_step: Array) -> Lines:
         """Return the lines after a small step (6,) or more, which moves them by (n,), px."""
         return self._replace(pixels=self.pixels + by_step[:, None] * self.normals,
                              center=self.center + step[:3])

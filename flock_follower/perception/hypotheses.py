@@ -78,7 +78,7 @@ class _Motion:
     """Whether a body has moved."""
 
     def __init__(self) -> None:
-        self.moved = False
+        self.has_moved = False
         self._since, self._place = -math.inf, (0.0, 0.0, 0.0)
 
     def take(self, time: float, place: Array) -> None:
@@ -86,7 +86,7 @@ class _Motion:
         x, y, z = place.tolist()
         if not 0.0 <= time - self._since <= WINDOW:
             self._since, self._place = time, (x, y, z)
-        self.moved = self.moved or math.dist(self._place, (x, y, z)) > MOVED
+        self.has_moved = self.has_moved or math.dist(self._place, (x, y, z)) > MOVED
 
 
 @dataclass(eq=False)
@@ -191,7 +191,7 @@ class Hypotheses:
         if newest is not None and time < newest.stamp - MAX_JUMP:
             self.reset()
         self.candidates = [each for each in self.candidates if time - each.seen <= (
-            MEMORY if each.confirmed and not each.motion.moved else self.params.max_gap)]
+            MEMORY if each.confirmed and not each.motion.has_moved else self.params.max_gap)]
         candidate = self.candidate_at(time, measured.translation)
         arguments = time, measured, reference, covariance
         if candidate is None:
@@ -201,7 +201,7 @@ class Hypotheses:
                 return Taken(outcome)
             candidate = self._choose_candidate(time, measured.translation)
         if time <= candidate.seen:
-            return Taken(UpdateOutcome.LATE, candidate)
+            return Taken(UpdateOutcome.OLDER, candidate)
         candidate.take(*arguments)
         last = self.primary.newest
         if another or (last is not None and abs(time - last.stamp) < BESIDE):
@@ -232,7 +232,7 @@ class Hypotheses:
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
             self._measured = 0
-        if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
+        if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.OLDER):
             self._measured += 1
             self._motion.take(time, measured.translation)
             for each in self.candidates:
@@ -247,12 +247,12 @@ class Hypotheses:
 
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
         """Return whether a candidate replaces the primary track; see the module."""
-        moved, last = candidate.motion.moved, self.primary.newest
+        moved, last = candidate.motion.has_moved, self.primary.newest
         if not self._marked and self._measured < N_CONFIRMED <= candidate.alone:
             return True
         if candidate.measured < self.params.max_rejections:
             return False
-        if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
+        if not self._motion.has_moved and (moved or self._nearer_to_loss(candidate)):
             return True
         if last is None or candidate.alone < self.params.max_rejections:
             return False

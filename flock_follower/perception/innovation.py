@@ -75,7 +75,7 @@ def root_of(covariance: Array) -> Array:
     return root
 
 
-def widened(covariance: Array, part: slice | Array, factor: float) -> Array:
+def scale_variances(covariance: Array, part: slice | Array, factor: float) -> Array:
     """Return a covariance with the variances of a part multiplied."""
     scale = np.ones(len(covariance))
     scale[part] = math.sqrt(factor)

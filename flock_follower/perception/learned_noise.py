@@ -21,14 +21,14 @@ square of the difference of two successive innovations shows
 the noise of the measurements, and their mean over ``MEAN_TIME`` shows the motion (Mehra, "On the
 identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control, 1970).
 
-``LearnedNoise``: across the line of sight, the noise is the error of the own attitude, which moves
+``LearnedNoise``: across the line of sight, the noise is the error of the ego attitude, which moves
 a neighbor sideways: errors of the odometry, of its interpolation and of the camera's stamps.
 Along the line of sight, the noise is anything that changes the marker's apparent size: a rolling
 shutter, a bent print, motion blur. The covariances of measured poses are widened, because the
 errors of neighboring edges may be alike: the innovations show how much of that is needed.
 
 ``LearnedMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
-follow the motion of a neighbor and the errors of the own velocity.
+follow the motion of a neighbor and the errors of the ego velocity.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 class LearnedNoise:
     """
-    The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
+    The noise of the ego attitude, rad, about each axis, and of the distance, as a share of it.
 
     ``shares``: of the variances of a measured position and attitude, the shares that are noise.
 
@@ -79,7 +79,7 @@ class LearnedNoise:
 
     @property
     def attitude(self) -> float:
-        """Return the noise of the own attitude, one standard deviation, rad."""
+        """Return the noise of the ego attitude, one standard deviation, rad."""
         return math.sqrt(self._across)
 
     @property
@@ -95,7 +95,7 @@ class LearnedNoise:
 
     def covariance(self, sight: Array) -> Array:
         """Return the covariance, (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
-        # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
+        # An attitude error e turns all measurements about the ego vehicle: it moves a marker at r
         # by e x r, and tilts it by e.
         leverage = _LEVERAGE.copy()
         leverage[:3] = skew(-sight)
@@ -108,7 +108,7 @@ class LearnedNoise:
         """
         Take the change of an innovation: the fields of ``neighbor_filter.Change``.
 
-        :param sight: from the own vehicle to the neighbor (3,), m.
+        :param sight: from the ego vehicle to the neighbor (3,), m.
         """
         # In plain numbers: for every image, and so small.
         (x, y, z), (u, v, w, *turn) = sight.tolist(), change.tolist()

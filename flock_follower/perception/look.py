@@ -19,7 +19,7 @@ One image in perception: its expected content, and the content that was found.
 rolling shutter exposes row r of an image of height h r / h * readout_time after the first row. A
 neighbor counts as seen when the row of its markers' middle was exposed. The rows above and below
 see it earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners
-to where they were with the middle row, by the relative motion, which comes mostly from the own
+to where they were with the middle row, by the relative motion, which comes mostly from the ego
 rates.
 """
 
@@ -74,7 +74,7 @@ class CameraMotion(NamedTuple):
 
     @property
     def turning(self) -> Array:
-        """Return the own angular velocity (3,), rad/s, in odom."""
+        """Return the ego angular velocity (3,), rad/s, in odom."""
         turning: Array = self.rotation.dot(self.own.angular_velocity)
         return turning
 
@@ -111,10 +111,10 @@ class CameraMotion(NamedTuple):
 def reported(estimate: Estimate, stamp: float, own: OdometrySample, attitude: float,
              velocity: float) -> Estimate:
     """
-    Return a state of the filter at a stamp, s, in odom, with the noise of the own state.
+    Return a state of the filter at a stamp, s, in odom, with the noise of the ego state.
 
-    :param attitude: variance of the white noise of the own attitude, rad^2, and
-        :param velocity: of the own velocity, (m/s)^2, per axis: the filter averages over both.
+    :param attitude: variance of the white noise of the ego attitude, rad^2, and
+        :param velocity: of the ego velocity, (m/s)^2, per axis: the filter averages over both.
     """
     x, y, z = (estimate.position - own.travel).tolist()
     covariance = estimate.covariance.copy()
@@ -131,7 +131,7 @@ class MeasuredPose(NamedTuple):
     A neighbor's body in the camera's optical frame, as measured in one image.
 
     ``covariance`` (6, 6): position of the body, m, and rotation vector, rad, along the camera's
-    axes. The errors of the own attitude, with which the filter takes the measurement, are not in
+    axes. The errors of the ego attitude, with which the filter takes the measurement, are not in
     it: they do not move a body in the camera's frame.
     """
 
@@ -191,8 +191,8 @@ def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeigh
     middle = T_camera_body.apply(reference)
     rows = camera.project(np.concatenate([seen, middle[None]]))[:, 1]
     later = readout_time / camera.height * (rows[:-1] - rows[-1])
-    moved = later[:, None] * (velocity + np.cross(rates, seen - middle))
-    found = refine(camera.project(seen - moved), camera, points, reference, T_camera_body)
+    displacement = later[:, None] * (velocity + np.cross(rates, seen - middle))
+    found = refine(camera.project(seen - displacement), camera, points, reference, T_camera_body)
     return T_camera_body if found is None else found[0]
 
 

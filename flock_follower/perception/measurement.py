@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.perception.edges import moved
+from flock_follower.perception.edges import apply_step
 
 #: Error of an expected attitude, rad (1 sigma).
 SIGMA_HISTORY = 0.1
@@ -133,7 +133,7 @@ class Measurement(NamedTuple):
     lens: int = 0
 
 
-def widened(measurement: Measurement, best: Choice) -> Measurement:
+def mix_poses(measurement: Measurement, best: Choice) -> Measurement:
     """Return a measurement with mean and covariance of both poses, and the margin of the best."""
     measurement = measurement._replace(margin=best.margin, doubt=min(best.share, 1.0 - best.share))
     if best.other is None or not best.share > 1e-6:
@@ -144,6 +144,6 @@ def widened(measurement: Measurement, best: Choice) -> Measurement:
         other.apply(measurement.reference) - at,
         matrix_to_rotation_vector(other.rotation @ pose.rotation.T)])
     return measurement._replace(
-        T_camera_body=moved(pose, at, best.share * apart),
+        T_camera_body=apply_step(pose, at, best.share * apart),
         covariance=measurement.covariance
         + best.share * (1.0 - best.share) * np.outer(apart, apart))

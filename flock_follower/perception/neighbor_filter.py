@@ -41,9 +41,9 @@ from flock_follower.perception.innovation import (
     AlikeErrors,
     expected_innovation,
     root_of,
+    scale_variances,
     squared_distance,
     to_body,
-    widened,
 )
 from flock_follower.perception.learned_noise import LearnedMotion, LEARNING_GAP
 from flock_follower.perception.neighbor_motion import (
@@ -66,7 +66,7 @@ from flock_follower.perception.range_gate import RangeGate
 _IDENTITY = np.eye(STATE_SIZE)
 #: Rows of the error state that are measured if the attitude is not used.
 _PLACE = _IDENTITY[POSITION]
-#: States to which the drift of the own position adds noise, (15, 15).
+#: States to which the drift of the ego position adds noise, (15, 15).
 _WANDERING = _PLACE.T.dot(_PLACE)
 #: Of the error state: the translation, and the rotation.
 _MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
@@ -87,6 +87,8 @@ NEAREST = 0.01
 SETTLING = 0.2
 #: The middle of a body, m.
 _BODY_CENTER = np.zeros(3)
+#: Direction of a distance, if the newest measurement was a pose.
+_NO_DIRECTION = np.zeros(3)
 _UNSCALED = [1.0] * 6  # attitude and its rate
 
 
@@ -98,7 +100,7 @@ class UpdateOutcome(Enum):
     SURPRISING = 'surprising, used with care'
     POSITION_ONLY = 'implausible attitude, position used'
     OUTLIER = 'outside the gate'
-    LATE = 'older than the estimate'
+    OLDER = 'older than the estimate'
     LOST = 'no track'
 
 
@@ -126,7 +128,7 @@ class NeighborFilter:
     def __init__(self, params: FilterParams | None = None) -> None:
         self.params = params or FilterParams()
         self.walk = 0.0
-        """Drift of the own position, m/sqrt(s)."""
+        """Drift of the ego position, m/sqrt(s)."""
         self._steps: dict[float, tuple[Array, Array, Array]] = {}
         self.reset()
 
@@ -143,7 +145,7 @@ class NeighborFilter:
         self._surprises: dict[str, Array] = {}
         self._alike = AlikeErrors()
         self._range_gate = RangeGate(most=self.params.max_rejections)
-        self._line = _BODY_CENTER  # on which the last distance was measured
+        self._range_direction = _NO_DIRECTION  # unit vector (3,) of the last distance, in odom
         self._motion = LearnedMotion()
         self._before: tuple[Array, Array] | None = None  # the last innovation, its covariance
 
@@ -159,7 +161,7 @@ class NeighborFilter:
         if stamp == now.stamp:
             return now
         if self._predicted is None or self._predicted.stamp != stamp:
-            self._predicted = now.moved(stamp, *self._transition(stamp - now.stamp))
+            self._predicted = now.propagate(stamp, *self._transition(stamp - now.stamp))
         return self._predicted
 
     def place(self, stamp: float) -> Transform | None:
@@ -174,7 +176,7 @@ class NeighborFilter:
         now = self.newest
         if now is None or stamp == now.stamp:
             return now
-        return now.moved(stamp, *self._transition(stamp - now.stamp))
+        return now.propagate(stamp, *self._transition(stamp - now.stamp))
 
     def continued(self, max_gap: float) -> NeighborFilter:
         """Return a copy of this filter that bridges gaps of up to ``max_gap`` s."""
@@ -183,7 +185,7 @@ class NeighborFilter:
         other._motion.factors = [max(factor, 1.0) for factor in self._motion.factors]
         return other
 
-    def shift(self, error: Array, later: float = 0.0) -> None:
+    def add_error(self, error: Array, later: float = 0.0) -> None:
         """
         Add an error state (15,) that was found elsewhere, and widen the covariance accordingly.
 
@@ -225,7 +227,7 @@ class NeighborFilter:
         now = self.newest
         if now is not None and stamp <= now.stamp:
             if now.stamp - stamp <= MAX_JUMP:
-                return UpdateOutcome.LATE
+                return UpdateOutcome.OLDER
             self.reset()
         expected = self.predict(stamp)
         whole = root = None if alike is None else root_of(alike)
@@ -247,7 +249,7 @@ class NeighborFilter:
         reached = doubt <= 1.0 or math.dist(T_odom_body.translation, now.position) <= reach
         if reached and doubt <= WILD_FACTOR:  # NaN is not
             if self._surprises_again('position', innovation[:3], doubt):
-                prior = widened(prior, _MOVING, doubt)
+                prior = scale_variances(prior, _MOVING, doubt)
                 across, spread = expected_innovation(prior, jacobian, noise, shared)
             elif doubt > 1.0:
                 noise = noise + (doubt - 1.0) * spread
@@ -262,7 +264,7 @@ class NeighborFilter:
         remain = _IDENTITY - gain.T.dot(jacobian)
         corrected = _corrected_covariance(prior, remain, gain, noise, shared)
         self._alike.take(remain, gain.T, root)
-        self._predicted, self._line = None, _BODY_CENTER
+        self._predicted, self._range_direction = None, _NO_DIRECTION
         self.newest = expected.corrected(gain.T.dot(innovation), corrected)
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
@@ -301,7 +303,7 @@ class NeighborFilter:
                                      and float(turn.dot(turn)) < MIN_MIRROR_ANGLE**2)
         if plausible:
             if self._surprises_again('attitude', turn, doubt):
-                prior = widened(prior, _TURNING, doubt)
+                prior = scale_variances(prior, _TURNING, doubt)
             elif doubt > 1.0:
                 covariance = covariance.copy()
                 covariance[3:, 3:] += (doubt - 1.0) * spread
@@ -319,7 +321,7 @@ class NeighborFilter:
     def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
                      reference: Array = _BODY_CENTER) -> UpdateOutcome:
         """
-        Update with the own distance, m, to ``reference`` (3,), a point on the body, m.
+        Update with the measured distance, m, to ``reference`` (3,), a point on the body, m.
 
         The update corrects the state only along the line between the two: an uncertain direction
         would otherwise change the state across it, too. ``range_gate`` handles outliers. No track
@@ -331,14 +333,14 @@ class NeighborFilter:
         now, expected = self.newest, self.predict(stamp)
         if now is None or expected is None or stamp == now.stamp:
             late = now is not None and stamp <= now.stamp
-            return UpdateOutcome.LATE if late else UpdateOutcome.LOST
+            return UpdateOutcome.OLDER if late else UpdateOutcome.LOST
         lever = expected.rotation.dot(reference)
         sight = expected.position + lever - own_position
         length = math.hypot(*sight.tolist())
         if not length > NEAREST:
             return UpdateOutcome.OUTLIER
         along, innovation = sight / length, distance - length
-        prior = turned_along(expected.covariance, self._line, along)
+        prior = turned_along(expected.covariance, self._range_direction, along)
         # However uncertain the attitude, the point is no farther from the body than its lever.
         swing = np.cross(lever, along)
         noise = variance + min(float(swing.dot(prior[ATTITUDE, ATTITUDE]).dot(swing)),
@@ -347,7 +349,7 @@ class NeighborFilter:
         factors = self._range_gate.judge(innovation, spread)
         if factors is None:
             return UpdateOutcome.OUTLIER
-        prior = widened(prior, _MOVING, factors[0])
+        prior = scale_variances(prior, _MOVING, factors[0])
         across = prior[:, POSITION].dot(along)
         expected_spread = float(along.dot(across[POSITION]))
         whole = factors[1] * (expected_spread + noise)
@@ -360,7 +362,7 @@ class NeighborFilter:
         self._alike.take(remain, gain, None)
         covariance = remain.dot(prior).dot(remain.T) + (whole - expected_spread) * np.outer(
             gain, gain)
-        self.change, self._predicted, self._line = None, None, along
+        self.change, self._predicted, self._range_direction = None, None, along
         self.newest = expected.corrected(innovation * gain, bounded_across(
             covariance, along, length, self.params.initial_speed))
         return UpdateOutcome.USED if factors == (1.0, 1.0) else UpdateOutcome.SURPRISING

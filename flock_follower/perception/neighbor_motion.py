@@ -58,8 +58,8 @@ class Estimate(NamedTuple):
     ``position`` (3,), m; ``velocity`` (3,), m/s; ``rotation`` (3, 3), body to odom;
     ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
     ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
-    odom's axes), angular velocity and acceleration. It is of the state relative to the own one:
-    both share the errors of the own odometry, but for the white noise of the own attitude and
+    odom's axes), angular velocity and acceleration. It is of the state relative to the ego one:
+    both share the errors of the ego odometry, but for the white noise of the ego attitude and
     velocity, which published covariances include.
     """
 
@@ -71,7 +71,7 @@ class Estimate(NamedTuple):
     acceleration: Array
     covariance: Array
 
-    def moved(self, stamp: float, linear: Array, transition: Array, noise: Array) -> Estimate:
+    def propagate(self, stamp: float, linear: Array, transition: Array, noise: Array) -> Estimate:
         """Return the state at another stamp, given ``neighbor_motion.transition`` to there."""
         dt = stamp - self.stamp
         return Estimate(
@@ -137,7 +137,7 @@ class Estimate(NamedTuple):
 
 
 _EYE_3 = np.eye(3)
-#: Random walk of the own position without a measured velocity, m/sqrt(s).
+#: Random walk of the ego position without a measured velocity, m/sqrt(s).
 ODOMETRY_WALK = 0.02
 #: Standard deviation of a neighbor's angular velocity before any motion was seen, rad/s.
 INITIAL_RATE = 0.5
@@ -151,9 +151,9 @@ class FilterParams(Checked):
     ``acceleration`` is the standard deviation of a neighbor's acceleration, m/s^2 per axis, and
     ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
     spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
-    ``odometry_noise`` is the random walk of the error of the own velocity, m/s^2/sqrt(Hz).
+    ``odometry_noise`` is the random walk of the error of the ego velocity, m/s^2/sqrt(Hz).
     ``initial_speed``, m/s, is the deviation before any motion has been seen.
-    ``attitude_noise``, rad, is the noise of the own attitude from one image to the next; it moves
+    ``attitude_noise``, rad, is the noise of the ego attitude from one image to the next; it moves
     a distant neighbor sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, or in 0.2 s at
     least three whose attitude is; as does a gap

@@ -156,7 +156,7 @@ class Perceiver:
 
     def take_odometry(self, state: OdometryState) -> bool:
         """
-        Take the own state; return whether time jumped back and everything restarted.
+        Take the ego state; return whether time jumped back and everything restarted.
 
         Images that were waiting are then forgotten.
         """

@@ -37,7 +37,7 @@ from flock_follower.perception.edge_fit import (
     MAX_TURN_STEP,
     REPROJECT_BEYOND,
 )
-from flock_follower.perception.edges import facing, moved, project, solve_normal
+from flock_follower.perception.edges import apply_step, facing, project, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import (
     angle,
@@ -46,9 +46,9 @@ from flock_follower.perception.measurement import (
     DEVIATION_FACTOR,
     Hypothesis,
     Measurement,
+    mix_poses,
     PosePrior,
     SAME_ATTITUDE,
-    widened,
 )
 from flock_follower.perception.print_model import edge_model, EdgeModel, shows_code
 from flock_follower.perception.smear_fit import (
@@ -114,11 +114,11 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           last: Measurement | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return a neighbor near its expected place, or None if its markers are not there.
+    Return the measurement of a neighbor near its expected place, or None if no marker fits.
 
-    :param last: its last measurement, if any: if its print was smeared, edges are looked for only
-        if it is so no longer.
-    :param check_mirrored: whether to make sure that the mirrored attitude is not the better one.
+    :param last: its last measurement, if any. If its print was smeared, the smear is fitted first,
+        and edges only if the print is sharp again.
+    :param check_mirrored: whether to compare with the mirrored attitude.
     """
     if expected.pose is None:
         return None
@@ -240,10 +240,10 @@ def _hypothesis_of(found: EdgeFit) -> Hypothesis:
 def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
                 pose: Transform, up: Array | None) -> bool:
     """
-    Return whether a detected marker may show another attitude than a pose, ``T_camera_body``.
+    Return whether a detected marker fits another attitude than that of ``pose``, T_camera_body.
 
-    It costs half of :func:`locate`, which then says which one: one attitude is fitted, and the
-    mirrored one to the edges found so.
+    The costs are half of those of :func:`locate`, which then returns the right pose: one attitude
+    is fitted to the image, and the mirrored one to the edges that this fit found.
     """
     alone, starts = _starts_of(camera, sought, index, corners)
     for start in starts:
@@ -375,7 +375,7 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
     least = min(each.rms for each in fits)
     best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
                    for each in fits], PosePrior(None, expected.up))
-    return widened(_smear_measurement(sought, index, best.chosen.fit), best)
+    return mix_poses(_smear_measurement(sought, index, best.chosen.fit), best)
 
 
 def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Measurement:
@@ -386,7 +386,7 @@ def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Meas
     if other is None or last is None:
         return measurement
     turned = angle(other, last.T_camera_body) < angle(pose, last.T_camera_body)
-    return widened(measurement, Choice(
+    return mix_poses(measurement, Choice(
         Hypothesis(pose, 0.0), 0.0, Hypothesis(other, 0.0),
         1.0 - last.doubt if turned else last.doubt))._replace(margin=None)
 
@@ -443,7 +443,7 @@ def _refit(camera: CameraModel, fitted: EdgeFit,
         step = solve_normal(moment.dot(design), moment.dot(offsets))
         if step is None or not float(np.abs(step[3:]).max()) < MAX_TURN_STEP:
             return None
-        pose = moved(pose, lines.center, step)
+        pose = apply_step(pose, lines.center, step)
         explained = design.dot(step)
         if float(np.abs(explained).max()) < REPROJECT_BEYOND:
             break
@@ -461,4 +461,4 @@ def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measure
     measurement = Measurement(
         sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing,
         alike=0.0 if _plain(found) else ALIKE_SHARE)
-    return measurement if best is None else widened(measurement, best)
+    return measurement if best is None else mix_poses(measurement, best)

@@ -50,7 +50,8 @@ OLDEST_POSE = 1.0
 #: s: a pose and a frame whose stamps differ by less are of one image.
 SAME_IMAGE = 1e-3
 MOST_WAITING = 100  # poses, and frames: a bound on memory
-#: m: a body that is nearer to the own frame is none: some detectors send zeros if they find none.
+#: m: a body that is nearer to its own frame, or in odom to this vehicle, is none: some detectors
+#: send zeros if they find none.
 NEAREST_POSE = 0.05
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
 AXES_VARIANCE = 1e-4
@@ -100,7 +101,7 @@ class PoseSources:
     """
     Takes poses and the stamps of frames; ``now`` is seconds on any clock that runs evenly.
 
-    ``frames`` has the optical frames of the own cameras on the body, ``static`` those of
+    ``frames`` has the optical frames of the ego cameras on the body, ``static`` those of
     ``/tf_static``.
 
     :param max_wait: the longest time for which a frame waits for its pose, s.
@@ -163,16 +164,16 @@ class PoseSources:
         nearest, farthest = (0.0, SANE) if T_body_frame is None else (NEAREST_POSE, FARTHEST)
         if not nearest <= math.hypot(*state.position.tolist()) <= farthest:  # NaN fails
             return INVALID, f'{name}: position {state.position.tolist()}'
-        checked = _attitude(source, state)
-        if isinstance(checked, str):
-            return checked, name
+        attitude = _attitude(source, state)
+        if isinstance(attitude, str):
+            return attitude, name
         covariance = _covariance(source, state)
         if isinstance(covariance, str):
             return covariance, name
         self._newest[name] = stamp
         if len(self._poses) < MOST_WAITING:
             insort(self._poses, _Waiting(
-                stamp, name, state, Transform.from_quaternion(state.position, checked),
+                stamp, name, state, Transform.from_quaternion(state.position, attitude),
                 covariance, T_body_frame, now), key=lambda waiting: waiting.stamp)
         return None
 
@@ -196,18 +197,29 @@ class PoseSources:
             if missing is not None:
                 yield UNPLACED, f'{each.name}: {missing.value}'
                 continue
+            if not self._is_plausible(each):
+                yield INVALID, f'{each.name}: position {each.state.position.tolist()}'
+                continue
             self._observe_latency(each)
             yield Sourced(each.name, each.state.stamp, self._process(each))
             if not self._with_frames:
                 yield from self._show(each.stamp, each.state.stamp)
         yield from self._due_frames(now)
 
+    def _is_plausible(self, each: _Waiting) -> bool:
+        """Return whether a pose in the frame of the odometry is in reach of the own place."""
+        own = self._tracker.own_pose(each.stamp)
+        if each.T_body_frame is not None or own is None:
+            return True  # it was checked when it was taken
+        apart = math.dist(each.state.position, own.translation)
+        return NEAREST_POSE <= apart <= FARTHEST
+
     def _process(self, each: _Waiting) -> Sighting:
         pose, covariance, mounting = each.pose, each.covariance, each.T_body_frame
         if self.sources[each.name].position_only:
-            turn = self._tracker.attitude(each.stamp)
-            if mounting is not None and turn is not None:  # the body has the axes of odom
-                pose = Transform((turn @ mounting.rotation).T, pose.translation)
+            own = self._tracker.own_pose(each.stamp)
+            if mounting is not None and own is not None:  # the body has the axes of odom
+                pose = Transform((own.rotation @ mounting.rotation).T, pose.translation)
         return self._tracker.process_pose(each.stamp, each.name, pose, covariance, mounting)
 
     def mounting(self, frame: str) -> Transform | None:

@@ -15,7 +15,7 @@
 """
 Tracks a neighbor that is out of sight by distances that a radio measures.
 
-One sensor measures the distances to a neighbor: all of them have one bias, one place of the own
+One sensor measures the distances to a neighbor: all of them have one bias, one place of the ego
 antenna, and stamps that only grow. A second sensor would need a series of its own.
 
 In sight, a marker measures the distance a hundred times better; then only the error of the ranges
@@ -67,11 +67,11 @@ Rejection = tuple[str, str]
 
 @dataclass(frozen=True)
 class RangingParams(Checked):
-    """Place of the own antenna on the body, FLU, m; noise of ranges without a variance, m."""
+    """Place of the ego antenna on the body, FLU, m; noise of ranges without a variance, m."""
 
     tag_position: tuple[float, float, float] = parameter(
         (0.0, 0.0, 0.0), Range(-5.0, 5.0, 'm'),
-        'place of the own antenna, from which ranges are measured, on the body, FLU', live=False)
+        'position of the antenna that measures the ranges, on the body, FLU', live=False)
     range_noise: float = parameter(
         0.1, Range(0.001, 10.0, 'm'),
         'standard deviation of ranges without a variance', live=False)
@@ -86,7 +86,7 @@ class Ranged(NamedTuple):
 
 
 class PlacedRange(NamedTuple):
-    """A range, by the filters' clock, s, and where the own antenna was (3,), m, in their frame."""
+    """A range, by the filters' clock, s, and where the ego antenna was (3,), m, in their frame."""
 
     stamp: float
     distance: float
@@ -99,7 +99,7 @@ class Ranging:
     Takes the ranges of all neighbors, and estimates the states of those out of sight.
 
     :param filters: of the neighbors seen, by name: never altered here.
-    :param odometry: the own one.
+    :param odometry: the ego one.
     """
 
     def __init__(self, neighbors: Iterable[MarkedNeighbor], filters: Mapping[str, NeighborFilter],

@@ -36,8 +36,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import (
+    apply_step,
     has_converged,
-    moved,
     normal_covariance,
     solve_normal,
 )
@@ -322,7 +322,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
                 or offset > _MAX_STEP_SHARE * at.center[2]
                 or math.hypot(*smear.tolist()) > _MAX_SMEAR):
             return None
-        pose = moved(pose, at.center, step)
+        pose = apply_step(pose, at.center, step)
         residual = at.brightness - step.dot(at.design)
         shift = max(offset / model.cell, smeared)
         factor = 1.0 if fresh and not known else _CLOSER_FACTOR

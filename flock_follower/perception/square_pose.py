@@ -28,7 +28,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edges import moved, solve_normal
+from flock_follower.perception.edges import apply_step, solve_normal
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import SAME_ATTITUDE
 
@@ -74,7 +74,7 @@ def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
             return None
         if np.max(np.abs(step)) < 1e-7:
             break
-        pose = moved(pose, middle, step)
+        pose = apply_step(pose, middle, step)
     return pose, jacobian
 
 
@@ -92,4 +92,4 @@ def mirror(pose: Transform, center: Array, facing_along: Array) -> Transform | N
     if sine < SAME_ATTITUDE:
         return None
     turn = axis / sine * math.atan2(sine, float(normal @ other))
-    return moved(pose, center, np.concatenate([np.zeros(3), turn]))
+    return apply_step(pose, center, np.concatenate([np.zeros(3), turn]))

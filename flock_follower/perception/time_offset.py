@@ -16,8 +16,8 @@
 Estimates the offset between the camera's stamps and the odometry's clock.
 
 An image of stamp t was exposed at t + offset on the odometry's clock. The measured points of a
-neighbor, taken to odom with the own poses at t + offset, are a smooth path only with the true
-offset: otherwise the rotation of the own vehicle moves them.
+neighbor, taken to odom with the ego poses at t + offset, are a smooth path only with the true
+offset: otherwise the rotation of the ego vehicle moves them.
 
 Every ``BATCH`` seconds, the points of each neighbor are taken to odom with each offset of a grid.
 The misfit of an offset is the chi^2 of a path that begins with any position, velocity and
@@ -200,7 +200,7 @@ class MountedCamera:
 
     :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
-    :param attitude_noise: of the own attitude as its images show it, before it is learned, rad.
+    :param attitude_noise: of the ego attitude as its images show it, before it is learned, rad.
     :param rectified: whether its images are undistorted already.
     """
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Perception: from images and own odometry to the neighbors' states.
+Perception: from images and ego odometry to the neighbors' states.
 
 Detection in each image has up to three stages, the cheapest first:
 
@@ -149,7 +149,7 @@ class Tracker:
         self._forget()
 
     def restart(self) -> None:
-        """Forget everything, the own odometry too."""
+        """Forget everything, the ego odometry too."""
         self._odometry.clear()
         self._forget()
 
@@ -166,7 +166,7 @@ class Tracker:
         """The result of :meth:`wanted`, for the image that is processed next."""
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
-        """Take the own state; return whether time jumped back and everything restarted."""
+        """Take the ego state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
         walk = ODOMETRY_WALK if sample.derived else 0.0
         for hypotheses in self._hypotheses.values():
@@ -191,10 +191,11 @@ class Tracker:
         """Return why there is no odometry of a stamp, s, yet, or None."""
         return self._odometry.missing(stamp, extrapolate=False)
 
-    def attitude(self, stamp: float) -> Array | None:
-        """Return the own rotation (3, 3), body to odom, at a stamp, s, if known."""
+    def own_pose(self, stamp: float) -> Transform | None:
+        """Return the pose of this vehicle in odom at a stamp, s, if known."""
         own = self._odometry.at(stamp)
-        return None if isinstance(own, Missing) else quaternion_to_matrix(own.quaternion)
+        return None if isinstance(own, Missing) else Transform(
+            quaternion_to_matrix(own.quaternion), own.position)
 
     def wanted(self, stamp: float, model: CameraModel, camera: str = '') -> bool:
         """
@@ -248,7 +249,7 @@ class Tracker:
         Return the estimate of a neighbor from its pose as another detector measured it.
 
         :param covariance: (6, 6), position, m, and rotation vector, rad, along the frame's axes.
-        :param T_body_frame: the frame on the own body; None: the frame is that of odom.
+        :param T_body_frame: the frame on the ego body; None: the frame is that of odom.
         """
         camera = self._sources[name]
         camera.T_body_camera = T_body_frame or Transform()
@@ -457,7 +458,7 @@ class Tracker:
         name, camera, sighting = measurement.name, look.camera, look.sighting
         outcome, candidate = taken
         other = look.measured.get(name) is not measurement
-        refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)
+        refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.OLDER)
         if not other and (refused or outcome is UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if refused:
@@ -493,9 +494,9 @@ class Tracker:
         if change is not None and estimate is not None:
             camera.noise.take(*change, estimate.position - view.own.travel)
         point = measurement.T_camera_body.apply(measurement.reference)
-        shift = camera.time_offset.take(
+        offset_change = camera.time_offset.take(
             name, placed.exposed, point, camera.T_body_camera, self._odometry)
-        if not shift:
+        if not offset_change:
             return
         camera.noise.restart()
         for other, hypotheses in self._hypotheses.items():
@@ -503,4 +504,4 @@ class Tracker:
                 for each in hypotheses.tracks:
                     if each.newest is not None:
                         sight = each.newest.position - view.own.travel
-                        each.shift(shift * view.moving(sight), shift)
+                        each.add_error(offset_change * view.moving(sight), offset_change)

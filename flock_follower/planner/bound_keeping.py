@@ -38,7 +38,8 @@ from flock_follower.planner.limits import (
 from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, nearest_in_order, product
 from flock_follower.planner.vectors import scalar_product
 
-# Reasons of bounds.
+# Reasons of bounds. Separation and cohesion are the guard's edges of the band; the law's terms of
+# the same names are in ``flocking``.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 #: Factor by which the correction for cohesion beyond ``v_max`` counts: see ``keep_bounds``.
 COHESION_INSISTENCE = 10.0
@@ -107,7 +108,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     speed across for very little, and the command would switch from tick to tick.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
-    :param velocity: own velocity (3,), m/s.
+    :param velocity: ego velocity (3,), m/s.
     :param required: the bounds, the most important first (see ``sort_bounds``).
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)

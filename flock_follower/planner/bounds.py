@@ -16,7 +16,7 @@
 The bounds on a command that one neighbor causes: separation, cohesion, sight.
 
 The guard holds ``sqrt(d0) < r < sqrt(d1)`` if the law alone does not. With p = x_F - x_L from
-the neighbor to the own vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it bounds the
+the neighbor to the ego vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it bounds the
 rate of the distance so that the change can still be stopped before the edge, less a margin m:
 
     h_near = s + S(r - sqrt(d0) - m) >= 0     S(g) = b (sqrt(tau^2 + 2 g / b) - tau)   for g >= 0
@@ -32,11 +32,11 @@ As ds/dt = n . (a - a_L) + |w_t|^2 / r, with w_t the part of w across n, this re
 
 of the acceleration a. The unknown part of a_L uses up margin: see ``docs/guard.md``.
 
-Behind another follower a headway T_h grows the near edge with the own speed -n . v_F towards it:
+Behind another follower a headway T_h grows the near edge with the ego speed -n . v_F towards it:
 
     g_near = r - sqrt(d0) - m - T_h (v_max - n . v_F)
 
-dg_near/dt = s + T_h (n . a + w_t . v_F / r) then has the own acceleration in it: with A the right
+dg_near/dt = s + T_h (n . a + w_t . v_F / r) then has the ego acceleration in it: with A the right
 side above, n . a >= (A - S'(g_near) T_h w_t . v_F / r) / (1 + S'(g_near) T_h). At the edge the
 velocity of the follower is that of the one ahead through (1 + tau z) / (1 + (tau + T_h) z), z the
 Laplace variable: without delays no motion of a column grows from one follower to the next.
@@ -45,7 +45,7 @@ The air below and above another vehicle is disturbed, so the horizontal distance
 its own. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
 
 If only the distance to a neighbor is known (ranges go on after sight is lost), it may be anywhere
-on a sphere around the own vehicle. The follower then backs away from the last known place. That
+on a sphere around the ego vehicle. The follower then backs away from the last known place. That
 helps as long as the neighbor, no faster than ``v_max``, cannot have reached the other side: in a
 time t it has moved at most v_max t, which must be less than sqrt(r^2 + d^2), with r the distance
 to that place and d the measured distance. Beyond, backing away is a guess, and the fences rank
@@ -104,11 +104,11 @@ def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], e
 
     Without a direction, or with a value that is not finite, the list is empty.
 
-    :param offset: own position minus the neighbor's, (3,), m.
-    :param relative_velocity: own velocity minus the neighbor's, (3,), m/s.
+    :param offset: ego position minus the neighbor's, (3,), m.
+    :param relative_velocity: ego velocity minus the neighbor's, (3,), m/s.
     :param neighbor_acceleration: a_L, the neighbor's, as far as it is known, (3,), m/s^2.
     :param seen: the neighbor is in sight.
-    :param velocity: own velocity (3,), m/s; of influence only with a headway.
+    :param velocity: ego velocity (3,), m/s; of influence only with a headway.
     """
     (x, y, z), w, a = offset, relative_velocity, neighbor_acceleration
     distance = math.hypot(x, y, z)
@@ -144,7 +144,7 @@ def in_sight(it: Prediction, position: Sequence[float], velocity: Sequence[float
     :param position: own (3,), m; :param velocity: own when the command acts (3,), m/s.
     :param seen: it is in sight; else its last height is unreliable.
     :param followed: it is followed; else the vehicle only keeps clear of it.
-    :param radii: sum of its radius and the own one, m.
+    :param radii: sum of its radius and the ego one, m.
     :param headway: see ``Edges``, s.
     """
     inner = params.edges
@@ -180,7 +180,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     Return the bound, if any, for a neighbor of which only the distance is known.
 
     :param known: the last estimate of its position; None without one.
-    :param velocity: own velocity when the command acts (3,), m/s.
+    :param velocity: ego velocity when the command acts (3,), m/s.
     """
     acceleration = ZERO_VECTOR if n.acceleration is None else n.acceleration.tolist()
     it = predict(n, acceleration, me.stamp - n.stamp, params)
@@ -197,7 +197,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
             towards = np.array([x, y, 0.0]) / apart
             sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(apart, distance)
     variance = float(along @ n.position_covariance @ along)
-    # The measured rate; until the command acts only the own motion on that line changes.
+    # The measured rate; until the command acts only the ego motion on that line changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = params.edges
     band = inner._replace(
@@ -219,8 +219,8 @@ def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Predict
         g (tan(lowest) - tan e) <= f . a <= g (tan(highest) - tan e)    e: elevation
         |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                         f, t: towards it, across
 
-    :param offset: its position minus the own one, m; :param velocity: the own one, m/s.
-    :param yaw: the own one, rad.
+    :param offset: its position minus the ego one, m; :param velocity: the ego one, m/s.
+    :param yaw: the ego one, rad.
     """
     x, y, z = offset
     distance = math.hypot(x, y)

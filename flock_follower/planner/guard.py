@@ -18,7 +18,7 @@ The guard: the order of all bounds on a command, and the command within them.
 Order of the bounds, most important first: separation from neighbors in sight, the fences,
 separation from neighbors out of sight, sight of the faced neighbor, cohesion. Lower-priority
 bounds never relax higher ones, and none of them relaxes ``a_max`` and ``v_max``. The vertical part
-of a command is bounded beforehand (``climb_range``, ``overflight``).
+of a command is bounded beforehand (``climb_rates``, ``overflight``).
 
 The bounds of one neighbor are those of :mod:`flock_follower.planner.bounds`.
 """
@@ -92,7 +92,7 @@ def sort_bounds(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
             *(each for each in reversed(near) if each.reason == COHESION)]
 
 
-def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
+def climb_rates(neighbors: Iterable[Neighbor], me: OwnState,
                 params: PlannerParams) -> tuple[float, float]:
     """
     Return the least and greatest vertical speed, m/s, that neighbors in sight permit.
@@ -174,7 +174,7 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
 
     :param nominal: horizontal part of the nominal acceleration (3,), m/s^2, without limits.
     :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
-    :param velocity: own velocity when the command acts (3,), m/s.
+    :param velocity: ego velocity when the command acts (3,), m/s.
     """
     # Limits lowered in flight bind the law and coasting, not braking and keeping clear.
     lowered, start = (params.a_max, params.v_max), (params.strongest, params.fastest)
@@ -262,7 +262,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
     if not (here or n.received):
         places = [it._replace(spread=0.0, spreading=0.0) if _is_covered(it, scene) else it
                   for it in places]
-    # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
+    # A follower in sight may go back at any time, as fast and as hard as the ego vehicle can.
     headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
     found = list[Bound]()
     for place in places:

@@ -61,7 +61,7 @@ UNKNOWN: Array = np.zeros((3, 3))
 
 class Neighbor(NamedTuple):
     """
-    A neighbor in the frame of the own odometry: stamp, s; position (3,), m; velocity (3,), m/s.
+    A neighbor in the frame of the ego odometry: stamp, s; position (3,), m; velocity (3,), m/s.
 
     The covariances, (3, 3), are of position and velocity; zeros mean unknown. ``acceleration``
     (3,), m/s^2, and ``yaw``, rad, are None if the estimate has none.
@@ -76,7 +76,7 @@ class Neighbor(NamedTuple):
     acceleration: Array | None = None
     yaw: float | None = None
     received: bool = False
-    """Whether another vehicle reported it; else the own camera sees it."""
+    """Whether another vehicle reported it; else a camera of this vehicle sees it."""
     member: Member = SEEN_DEFAULT
     """Role and size of the neighbor, from its file."""
 

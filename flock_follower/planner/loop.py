@@ -26,7 +26,7 @@ from flock_follower.acceleration_messages import AccelerationState, with_acceler
 from flock_follower.bridge_state import ACTIVE, BridgeState, effective_state, parse, TAKEN_OVER
 from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.messages import OdometryState, RELATIVE
+from flock_follower.messages import FUTURE_TOLERANCE, OdometryState, RELATIVE
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import Memory
@@ -124,7 +124,7 @@ class PlannerLoop:
         return '' if bridge.name == ACTIVE else f'the bridge: {bridge}'
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
-        """Take the own state at a time, ns; only the newest since the last tick counts."""
+        """Take the ego state at a time, ns; only the newest since the last tick counts."""
         if not self._choice.takes(state):
             return
         stamp = self._newest
@@ -142,7 +142,7 @@ class PlannerLoop:
         """
         Take a neighbor's state.
 
-        :param received: whether another vehicle reported it; else the own camera sees it.
+        :param received: whether another vehicle reported it; else this vehicle sees it.
         :raises ValueError: if it is not in the frame of the odometry.
         """
         if not self._frame:
@@ -216,6 +216,8 @@ class PlannerLoop:
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
             n.velocity_covariance, None if received else self._acceleration(n), _yaw(n), received)
             for n, received in self._neighbors]
+        if self.memory.now is not None and now < self.memory.now - FUTURE_TOLERANCE:
+            self.ground = None  # of another run of the simulation, or recording
         self._own, self._neighbors = None, []
         self._earlier_accelerations, self._accelerations = self._accelerations, []
         if self._looked is not None:
@@ -228,7 +230,7 @@ class PlannerLoop:
                                      looked, waiting, self.view, self.ground,
                                      [self.seconds(stamp) for stamp in self._frames])
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
-            self.ground = None
+            self.ground = None  # it is of another frame
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
         # The stamp of the estimate on which the command rests, or that of the tick.

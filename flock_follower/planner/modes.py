@@ -62,7 +62,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     """
     Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
-    :param fault: fault of the own odometry or of perception, or ''.
+    :param fault: fault of the ego odometry or of perception, or ''.
     :param youngest: age of the youngest estimate of a neighbor in sight, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: reason why it may not command yet, or why it was disengaged, or ''.
@@ -98,9 +98,9 @@ def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> s
     return f'odometry {fault.reason} ({fault.detail})' if fault else ''
 
 
-LATE = 0.5  # share of odom_timeout: younger odometry is never late
-LATEST = 0.8  # share of odom_timeout: older odometry always is late, to brake before commands end
-OVERDUE = 1.2  # times the greatest age that the last messages reached
+NEVER_LATE_SHARE = 0.5  # share of odom_timeout: younger odometry is never late
+ALWAYS_LATE_SHARE = 0.8  # share of odom_timeout: older odometry is late, to brake in time
+OVERDUE_FACTOR = 1.2  # factor on the greatest age that the last messages reached
 
 
 def odometry_delay(own: OwnState | None, now: float, params: PlannerParams) -> str:
@@ -108,16 +108,17 @@ def odometry_delay(own: OwnState | None, now: float, params: PlannerParams) -> s
     Return that odometry is late, or that its source is too slow, or ''.
 
     Between two messages the age of odometry grows: at 10 Hz and 60 ms of latency it is 0.16 s
-    old just before the next message arrives. A fast source is late at ``LATE`` of the timeout, a
-    slow one if its message becomes older than the last ones did.
+    old just before the next message arrives. A fast source is late at ``NEVER_LATE_SHARE`` of the
+    timeout, a slow one if its message becomes older than the last ones did.
     """
     if own is None:
         return ''
-    age, latest = now - own.stamp, LATEST * params.odom_timeout
+    age, latest = now - own.stamp, ALWAYS_LATE_SHARE * params.odom_timeout
     usual = sorted(own.ages)[len(own.ages) // 2] if own.ages else 0.0
     if usual > latest:
         return f'odometry too slow ({usual:.2f} s old before the next comes)'
-    longest = max(LATE * params.odom_timeout, OVERDUE * max(own.ages, default=0.0))
+    longest = max(NEVER_LATE_SHARE * params.odom_timeout,
+                  OVERDUE_FACTOR * max(own.ages, default=0.0))
     return f'odometry late ({age:.2f} s)' if age > min(longest, latest) else ''
 
 

@@ -49,7 +49,7 @@ GAP_MIN = 1e-3  # m: least distance of hulls for the law, if they touch or overl
 
 
 class Neighborhood(NamedTuple):
-    """The neighbors at hand, all at one time, and their relations to the own vehicle."""
+    """The neighbors in use, all at one time, and their relations to the ego vehicle."""
 
     flock: Sequence[Neighbor]
     shares: Mapping[str, float]
@@ -57,14 +57,14 @@ class Neighborhood(NamedTuple):
     edges: frozenset[str]
     """Names of the neighbors with an edge; from the others the vehicle only keeps clear."""
     faced: Neighbor | None
-    """The neighbor that it faces and keeps in sight."""
+    """The neighbor that the vehicle faces and keeps in sight."""
     level: Neighbor | None
-    """The neighbor whose altitude it follows; None: it holds its altitude."""
+    """The neighbor whose altitude the vehicle follows; None: the altitude is held."""
     distances: Mapping[str, float]
     """Between the centers, m."""
 
     def clearance(self, n: Neighbor, params: PlannerParams) -> float:
-        """Return the distance between the own hull and a neighbor's, m."""
+        """Return the distance between the ego hull and a neighbor's, m."""
         return clearance(self.distances[n.name], n, params)
 
 
@@ -72,7 +72,7 @@ NOBODY = Neighborhood((), {}, frozenset(), None, None, {})
 
 
 def clearance(distance: float, n: Neighbor, params: PlannerParams) -> float:
-    """Return the distance between the own hull and a neighbor's, m, from that of the centers."""
+    """Return the distance between the ego hull and a neighbor's, m, from that of the centers."""
     return max(distance - (params.radius + n.member.radius), 0.0)
 
 
@@ -152,13 +152,13 @@ def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> l
         if edge and speed > KEPT_UP_WITH * v_max:
             found.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
         if distance < near:
-            found.append(f'{n.name} {distance:.2f} m away, the band begins at {near:.2f} m: '
-                         'too close')
+            found.append(f'{n.name} is too close: {distance:.2f} m, the band begins at '
+                         f'{near:.2f} m')
         if edge and distance > far:
-            found.append(f'{n.name} {distance:.2f} m away, the band ends at {far:.2f} m: too far')
+            found.append(f'{n.name} is too far: {distance:.2f} m, the band ends at {far:.2f} m')
     missing = {name for name, each in params.vehicles.items() if each.role != AVOID}
     missing -= memory.flock.keys()  # with those lost a moment ago
-    return [*found, *(f'{name} neither seen nor received, not kept clear of'
+    return [*found, *(f'{name} neither seen nor received: no distance to it is kept'
                       for name in sorted(missing))]
 
 
@@ -194,7 +194,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     In TRACK it is that of the law, or of the fade-in; in COAST zero; else it brakes to a hover. If
     odometry jumped while a neighbor came, it retreats until it sees one.
 
-    :param velocity: own velocity when the command acts (3,), m/s.
+    :param velocity: ego velocity when the command acts (3,), m/s.
     """
     if state is not State.TRACK:
         lost = memory.lost
@@ -225,7 +225,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
 
 
 def _offsets(neighbors: Neighborhood, me: OwnState, params: PlannerParams) -> Array:
-    """Return the vectors (m, 3), m, from the own hull to those of the neighbors."""
+    """Return the vectors (m, 3), m, from the ego hull to those of the neighbors."""
     shares = []
     for n in neighbors.flock:
         distance = max(neighbors.distances[n.name], GAP_MIN)

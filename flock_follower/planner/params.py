@@ -255,7 +255,7 @@ class PlannerParams(Checked):
         'yaw rate of the search for a neighbor; 0: no search', live=True)
 
     radius: float = parameter(
-        0.0, RADIUS, 'radius of the own hull: all distances are between hulls', live=True)
+        0.0, RADIUS, "radius of this vehicle's hull: all distances are between hulls", live=True)
     vehicles: Mapping[str, Member] = field(default_factory=dict, hash=False)
     """Roles and sizes of other vehicles, by name."""
 

@@ -36,7 +36,7 @@ ROUNDING_ERROR = 1e-11  # likewise inside a search: far above rounding, far belo
 PARALLEL = 1e-11  # slope along a line of a bound that is parallel to it but for rounding
 _HUGE = 1e30  # stands for infinity, which cannot be subtracted from itself
 
-#: A bound: a normal, and the least that its scalar product with a point may be.
+#: A bound: a normal n and a level c; a point p keeps the bound if product(n, p) >= c.
 Side = tuple[complex, float]
 
 
@@ -102,11 +102,11 @@ class _Line(NamedTuple):
     high: float
     """At most ``low`` if the line misses the common part of the discs."""
     gap: float
-    """Distance by which the line misses the discs; at most 0 if it meets them."""
+    """Distance by which the line misses the discs; <= 0 if the line meets them."""
 
     @classmethod
     def of(cls, normal: complex, level: float, discs: Discs) -> _Line:
-        """Return the line of the points whose product with the normal is ``level``."""
+        """Return the line of the points p with ``product(normal, p) == level``."""
         center, radius, other, other_radius = discs
         size = abs(normal)
         unit, least = (normal / size, level / size) if size else (normal, level)
@@ -132,7 +132,7 @@ class _Line(NamedTuple):
         return self.foot + min(max(best, low), high) * self.along
 
     def slope(self, normal: complex) -> float:
-        """Return how fast the product with a normal grows along the line."""
+        """Return the slope of ``product(normal, p)`` for points p along the line."""
         slope = product(self.along, normal)
         return 0.0 if abs(slope) < PARALLEL else slope
 

@@ -154,7 +154,7 @@ def level_command(me: OwnState, coming: Array, leader: Neighbor, others: Sequenc
     """
     Return the horizontal acceleration (2,), m/s^2, without limits.
 
-    :param me: own state, now; :param coming: velocity commanded and not flown yet (3,), m/s.
+    :param me: ego state, now; :param coming: velocity commanded and not flown yet (3,), m/s.
     :param leader: the neighbor to follow, by its newest estimate, at its stamp.
     :param others: likewise, those to keep clear of.
     """

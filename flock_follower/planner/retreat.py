@@ -90,10 +90,10 @@ def fallback_retreat(memory: Memory, scene: Scene,
     """
     Return the retreat that keeps the distance to a neighbor while odometry is lost, or None.
 
-    A neighbor counts that approaches, or will in TRUSTED_TIME; the nearest of several. One that
+    The retreat is from the nearest neighbor that approaches, or will in TRUSTED_TIME. One that
     has begun to accelerate towards the vehicle counts, too, if it would come nearer than the
     margin within ODOMETRY_GAP: see ``turned_path``. The retreat from it is as fast as that
-    requires. As out of sight, the retreat has a limit.
+    requires. Its length is limited like that of a retreat out of sight.
     """
     if not params.guard or params.retreat_max == 0.0:
         return None

@@ -15,7 +15,7 @@
 """
 The scene of one step, and the decision that the step makes.
 
-The scene is the own state, the neighbors at hand, and those lost that may still be near.
+The scene is the ego state, the neighbors at hand, and those lost that may still be near.
 
 ``survey`` also updates the memory: the neighbors to keep clear of, their motions, and the loss of
 sight of the neighbor that the vehicle followed.
@@ -152,7 +152,8 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
              or (leader is not None and leader.name == name)
              or (silent(n, now, params) and now - n.stamp <= params.resume_timeout)}
     return by_name(flock | {n.name: n for n in memory.neighbors.values()
-                            if state is State.TRACK or n.member.role == AVOID})
+                            if state is State.TRACK or n.member.role == AVOID
+                            or n.name in memory.flock})
 
 
 def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
@@ -211,7 +212,7 @@ def across_path(velocity: Sequence[float], offset: Array) -> Array:
     Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
 
     :param velocity: of the neighbor (3,), m/s.
-    :param offset: own position minus the neighbor's (3,), m.
+    :param offset: ego position minus the neighbor's (3,), m.
     """
     x, y, _ = velocity
     length = math.hypot(x, y)

@@ -106,8 +106,8 @@ def visible(view: FieldsOfView, offset: Array, yaw: float, forward: float, margi
     """
     Return whether a neighbor is in an image, at least a margin, m, inside its edge.
 
-    :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
-    :param forward: own acceleration ahead, m/s^2, which tilts the camera.
+    :param offset: its position minus the ego one (3,), m; :param yaw: the ego one, rad.
+    :param forward: ego acceleration ahead, m/s^2, which tilts the camera.
     """
     x, y, z = offset.tolist()
     distance = math.hypot(x, y)
@@ -131,10 +131,10 @@ def vertical(view: FieldsOfView, bearing: float) -> tuple[float, float]:
 
 
 #: Consecutive processed images without the marker that begin an occlusion, and with it to end it.
-IMAGES = 3
+OCCLUSION_IMAGES = 3
 #: The same, to begin, of a neighbor without markers: other detectors miss single images. Of a
 #: detector that misses a quarter of them, three in a row are missed every 8 s at 10 Hz.
-IMAGES_WITHOUT_MARKER = 5
+OCCLUSION_IMAGES_NO_MARKER = 5
 MOST_PATIENT = 0.7  # s: age of an estimate from which on IMAGES count for any detector
 #: Distance of the predicted marker to the image's edge, m: two markers of 0.2 m.
 OCCLUSION_MARGIN = 0.4
@@ -157,9 +157,9 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
 
     :param before: the occlusion in the last step.
     :param n: its newest estimate; None if there is none.
-    :param me: own state now.
+    :param me: ego state now.
     :param frames: stamps of the newest processed images, s, in their order.
-    :param forward: own acceleration ahead, m/s^2, which tilts the camera.
+    :param forward: ego acceleration ahead, m/s^2, which tilts the camera.
     """
     if n is None or n.received or not view:
         return None if n is None else before
@@ -167,12 +167,12 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     if before is None:
         offset = propagate(n, me.stamp).position - me.position
         patient = not n.member.faces and me.stamp - n.stamp < MOST_PATIENT
-        needed = IMAGES_WITHOUT_MARKER if patient else IMAGES
+        needed = OCCLUSION_IMAGES_NO_MARKER if patient else OCCLUSION_IMAGES
         lost = missed >= needed and visible(view, offset, me.yaw, forward, OCCLUSION_MARGIN)
         return Occlusion(n.stamp) if lost else None
-    if missed >= IMAGES:
+    if missed >= OCCLUSION_IMAGES:
         return Occlusion(n.stamp)
     found = min(before.found, n.stamp) if n.stamp > before.lost + _STAMP_TOLERANCE else math.inf
     shown = sum(found - _STAMP_TOLERANCE <= stamp <= n.stamp + _STAMP_TOLERANCE
                 for stamp in frames)
-    return None if shown >= IMAGES else before._replace(found=found)
+    return None if shown >= OCCLUSION_IMAGES else before._replace(found=found)

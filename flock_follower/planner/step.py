@@ -34,7 +34,7 @@ import numpy as np
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner import relative
 from flock_follower.planner.bound_keeping import SEPARATION
-from flock_follower.planner.guard import climb_range, constrain
+from flock_follower.planner.guard import climb_rates, constrain
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import ingest, Memory, update_pending
 from flock_follower.planner.modes import blind, next_state, odometry_delay, odometry_fault, State
@@ -181,7 +181,7 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,
         # The climb lasts as long as the loss: the next one begins at the altitude held before.
         raised = min(overflight(memory.lost, me.position, altitude.held, params), altitude.highest)
     return altitude.control(
-        me, params, *climb_range(near, me, params), coming, raised)
+        me, params, *climb_rates(near, me, params), coming, raised)
 
 
 def _yaw(last: float, memory: Memory, scene: Scene, params: PlannerParams,

@@ -19,9 +19,9 @@ The altitude to hold follows that of the nearest neighbor, because a camera that
 loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
 (s + w)^2, critically damped. The gate offsets an error of the hover thrust.
 
-The vehicle stops in time before the lowest and the highest altitude: the nearer they are when a
-command acts, the slower it may approach them. A target that ends there is not enough: the vehicle
-overshot it by 0.25 m, because of the target's climb and of commands not yet flown.
+The vehicle stops at the lowest and at the highest altitude: its vertical speed is limited by the
+distance to them at the time a command acts. To limit only the target altitude is not enough: the
+vehicle overshot by 0.25 m, because of the target's climb and of commands not yet flown.
 
 The neighbor's vertical velocity is smoothed, without lag if its acceleration is known. A
 velocity v as small as its noise counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, as
@@ -155,7 +155,8 @@ class Altitude(NamedTuple):
         if least > -math.inf:
             low = max(min(least, up), -down) - rate - coming
             vertical = max(vertical, min(low / params.guarding.T_g, strongest))
-        return self._replace(commanded=goal if clear == speed else math.nan), vertical
+        within = min(max(goal, self.lowest), self.highest)  # bounds may have changed in flight
+        return self._replace(commanded=within if clear == speed else math.nan), vertical
 
 
 def _within_limits(ground: float, params: PlannerParams) -> tuple[float, float]:

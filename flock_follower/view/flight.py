@@ -111,7 +111,7 @@ class ShownFlight:
         self._times[source] = now
 
     def take_odometry(self, state: OdometryState, now: float) -> bool:
-        """Take the own state; return whether it is in the frame that is used."""
+        """Take the ego state; return whether it is in the frame that is used."""
         if not self._choice.takes(state):
             return False
         if self.own is not None and self.own.frame != state.frame:

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, matrix_to_quaternion
-from flock_follower.messages import OdometryState
+from flock_follower.messages import OdometryState, SANE
 from flock_follower.planner.bound_keeping import COHESION, REASONS, SEPARATION
 
 #: Kinds of shapes.
@@ -129,7 +129,7 @@ def _neighbor(own: OdometryState | None, state: OdometryState, age: float,
     if np.linalg.norm(velocity) > MIN_LENGTH:
         shapes.append(Shape(f'{name} velocity', ARROW, paint, ARROW_SIZE,
                             points=[at, at + velocity]))
-    if np.all(np.isfinite(state.pose_covariance[:3, :3])):
+    if np.all(np.abs(state.pose_covariance[:3, :3]) <= SANE):  # NaN fails
         shapes.append(ellipsoid(f'{name} covariance', at, state.pose_covariance[:3, :3]))
     if name not in report.get('edges', '').split(', '):
         return shapes
@@ -165,7 +165,7 @@ def _follower(own: OdometryState, command: tuple[Command, float] | None,
 
 
 def ellipsoid(name: str, center: Array, covariance: Array) -> Shape:
-    """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``DEVIATIONS`` sigma."""
+    """Return the ellipsoid of a plausible covariance (3, 3), m^2, at ``DEVIATIONS`` sigma."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]

@@ -16,8 +16,9 @@
 The server of the live page: aiohttp in a thread of its own.
 
 Each page has room for one state and one image that wait: a slow browser gets fewer of them, and
-neither it nor ten pages hold up anything else. The methods of :class:`PageServer` may be called
-from any thread.
+neither it nor ten pages hold up anything else. A connection that is no open page ends in time,
+whatever it sends, reads or leaves unread: without a limit clients use up the sockets of the
+process. The methods of :class:`PageServer` may be called from any thread.
 """
 
 from __future__ import annotations
@@ -54,6 +55,9 @@ HEADERS: Final = {
     'Referrer-Policy': 'no-referrer', 'Cross-Origin-Resource-Policy': 'same-origin',
     'Cross-Origin-Opener-Policy': 'same-origin', 'Cache-Control': 'no-store'}
 PAGES_MAX = 24
+CONNECTIONS_MAX = 64  # a further one ends the oldest that is no open page
+BACKLOG = 16  # connections that wait to be accepted
+CONNECTION_TIME = 30.0  # s for which a connection may last that is no open page
 ANSWERS_MAX = 8  # that wait for a slow page
 LONGEST_REQUEST = 1024  # bytes of a message from a page
 HEARTBEAT = 5.0  # s: a page that answers no ping within half of it is gone
@@ -73,8 +77,9 @@ REFUSALS: Final = {
 class _Page:
     """One open page: what waits to be sent to it."""
 
-    def __init__(self, token: str, socket: web.WebSocketResponse) -> None:
-        self.token, self.socket = token, socket
+    def __init__(self, token: str, socket: web.WebSocketResponse,
+                 connection: asyncio.BaseProtocol) -> None:
+        self.token, self.socket, self.connection = token, socket, connection
         self.greeted = False
         """Whether it has got the history."""
         self.state: str | None = None
@@ -100,6 +105,7 @@ class PageServer:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._runner: web.AppRunner | None = None
+        self._listener: asyncio.Server | None = None
 
     @property
     def pages(self) -> int:
@@ -177,11 +183,36 @@ class PageServer:
         self._runner = web.AppRunner(
             self.application(), access_log=None, shutdown_timeout=STOP_TIMEOUT)
         await self._runner.setup()
-        site = web.TCPSite(self._runner, self.access.host, self.port)
-        await site.start()
-        self.port = self._runner.addresses[0][1]
+        self._listener = await self._loop.create_server(
+            self._accept, self.access.host, self.port, backlog=BACKLOG)
+        self.port = self._listener.sockets[0].getsockname()[1]
+
+    def _accept(self) -> asyncio.BaseProtocol:
+        """Return the protocol of a new connection."""
+        assert self._runner is not None and self._runner.server is not None
+        connection = self._runner.server()
+        self._loop.call_later(0.0, self._end_surplus)  # when it is one of the connections
+        self._loop.call_later(CONNECTION_TIME, self._end_unless_page, connection)
+        return connection
+
+    def _end_surplus(self) -> None:
+        """End the oldest connections that are no open page, if there are too many."""
+        server = self._runner and self._runner.server  # None once it has stopped
+        every = server.connections if server else []
+        others = [each for each in every if not self._is_page(each)]
+        for oldest in others[:max(len(every) - CONNECTIONS_MAX, 0)]:
+            _end(oldest)
+
+    def _is_page(self, connection: asyncio.BaseProtocol) -> bool:
+        return any(page.connection is connection for page in self._pages)
+
+    def _end_unless_page(self, connection: asyncio.BaseProtocol) -> None:
+        if not self._is_page(connection):
+            _end(connection)
 
     async def _stop(self) -> None:
+        if self._listener is not None:
+            self._listener.close()
         if self._runner is not None:
             await self._runner.cleanup()
 
@@ -237,7 +268,7 @@ class PageServer:
             return web.Response(status=503, text=f'{PAGES_MAX} pages are open already\n')
         socket = web.WebSocketResponse(
             heartbeat=HEARTBEAT, max_msg_size=LONGEST_REQUEST, compress=False)
-        page = _Page(self._read_token(request), socket)
+        page = _Page(self._read_token(request), socket, request.protocol)
         page.answers.append(_message('about', {
             **self._about, 'control': self.access.refuse_button(page.token)}))
         self._pages.add(page)
@@ -252,6 +283,7 @@ class PageServer:
                     self._press(page, message.data)
         finally:
             self._pages.discard(page)
+            self._loop.call_later(CONNECTION_TIME, self._end_unless_page, page.connection)
             if sender is not None:
                 sender.cancel()
             self._viewers()
@@ -295,6 +327,12 @@ class PageServer:
 
 async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(HEADERS)
+
+
+def _end(connection: Any) -> None:
+    """End a connection at once: what it leaves unread would keep it open."""
+    if connection.transport is not None:  # else it has ended
+        connection.transport.abort()
 
 
 def _message(kind: str, value: dict[str, Any]) -> str:

@@ -28,6 +28,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+import yaml
 
 from flock_follower.bags.bag import BagError, deserialize, open_bag, serialize, typestore
 from flock_follower.bags.writer import BagWriter
@@ -169,7 +170,7 @@ def test_topics_and_times_select_messages(tmp_path):
 
 @pytest.mark.parametrize(('topics', 'said'), [
     ([('a', 'a_msgs/msg/B')], 'unknown message type a_msgs/msg/B'),
-    ([('b', STRING), ('b', BOOL)], f'/b: holds {STRING}, not {BOOL}')])
+    ([('b', STRING), ('b', BOOL)], f'/b: has type {STRING}, not {BOOL}')])
 def test_a_writer_refuses_what_no_reader_could_use(tmp_path, topics, said):
     with pytest.raises(BagError, match=said), BagWriter(tmp_path / 'bag') as bag:
         for topic, msgtype in topics:
@@ -340,3 +341,38 @@ def test_damaged_messages_raise_bag_error_pixels_not_copied():
             with contextlib.suppress(BagError):
                 deserialize(bytes(data), msgtype)
     assert np.shares_memory(deserialize(good, msgtype).data, np.frombuffer(good, np.uint8))
+
+
+@pytest.mark.parametrize('metadata', [True, False])
+@pytest.mark.parametrize('form', ['mcap', 'sqlite3'])
+def test_split_files_that_overlap_are_read_by_time(tmp_path, form, metadata):
+    """Files of one folder, the later one first and both with messages of the same time."""
+    folder = tmp_path / 'split'
+    folder.mkdir()
+    plugin = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}[form]
+    names, stamps = [], ([4, 6, 8, 10], [1, 5, 6, 9], [20], [0, 2, 3])
+    for i, each in enumerate(stamps):
+        part = tmp_path / f'part_{i}'
+        with Rosbag2Writer(part, version=9, storage_plugin=plugin) as writer:
+            topic = writer.add_connection(f'/topic_{i % 2}', STRING, typestore=typestore())
+            for stamp in each:
+                writer.write(topic, START + stamp, serialize(string(f'{stamp} of {i}'), STRING))
+        names.append(f'split_{i}{storage_file(part).suffix}')
+        storage_file(part).rename(folder / names[-1])
+    if metadata:
+        (folder / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': {
+            'version': 9, 'storage_identifier': form, 'compression_format': '',
+            'compression_mode': '', 'relative_file_paths': names,
+            'message_count': sum(map(len, stamps)), 'duration': {'nanoseconds': 20},
+            'starting_time': {'nanoseconds_since_epoch': START}, 'topics_with_message_count': [{
+                'topic_metadata': {
+                    'name': f'/topic_{k}', 'type': STRING, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': []},
+                'message_count': sum(map(len, stamps[k::2]))} for k in (0, 1)]}}))
+    with open_bag(folder) as bag:
+        read = [m.stamp_ns - START for m in bag.messages()]
+        part = [m.stamp_ns - START for m in bag.messages(['/topic_1'], START + 2, START + 7)]
+        texts = [deserialize(m.data, STRING).data for m in bag.messages()]
+        assert bag.set_back_ns == 9  # the fourth file begins with 0, the second ended with 9
+    assert read == [0, 1, 2, 3, 4, 5, 6, 6, 8, 9, 10, 20] and part == [2, 3, 5, 6]
+    assert texts[6:8] == ['6 of 0', '6 of 1']  # of the same time: in the order of the files

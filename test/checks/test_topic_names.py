@@ -75,7 +75,7 @@ def test_running_nodes_are_connected_by_arguments_of_the_launch() -> None:
 @pytest.mark.parametrize('msgtype', POSES)
 def test_a_pose_is_named_if_there_is_no_odometry(msgtype: str) -> None:
     poses = {'/goal_pose': POSES[0], '/vio/pose': msgtype, '/scan': 'sensor_msgs/msg/LaserScan'}
-    assert offer('odom', poses).startswith(f'/vio/pose holds {msgtype}')
+    assert offer('odom', poses).startswith(f'/vio/pose has type {msgtype}')
     assert '/vio/odom' in offer('odom', {**poses, '/vio/odom': ODOMETRY})
     assert offer('odom', {'/goal_pose': POSES[0]}) == ''
 

@@ -83,7 +83,7 @@ class Report:
     """The states of one vehicle that another received in a flight."""
 
     errors: list[float] = field(default_factory=list)
-    """Of the received place at the stamp, relative to the own one, m."""
+    """Of the received place at the stamp, relative to the ego one, m."""
     chi2: list[float] = field(default_factory=list)
     """Of its prediction to the time of use."""
     since: float | None = None

@@ -89,9 +89,10 @@ def test_hold_is_requested_once_and_again_if_it_failed():
     assert step(end, 1.2, pending=True) == ''
     assert step(end, 1.3) == ''  # it failed: again after a while, though the cause is gone
     assert step(end, 1.2 + RETRY_PERIOD) == HOLD
-    assert step(end, 5.0, flies=False, held='AUTO.LOITER', status=HELD) == ''
+    assert step(end, 3.3, flies=False, held='AUTO.LOITER', status=HELD) == ''
     end.begin()
-    assert end.why == '' and step(end, 99.0) == ''
+    assert end.why == '' and step(end, 3.4) == ''
+    assert step(end, 3.5, why=lost) == HOLD  # a new flight waits for no earlier request
 
 
 def handed_over(status=HELD):

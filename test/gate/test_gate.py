@@ -250,6 +250,22 @@ def test_odometry_that_starts_anew_keeps_the_radius(pause, velocity):
     assert gate.place(now + pause).offset[0] == pytest.approx(far, abs=1.5)
 
 
+@pytest.mark.parametrize('pause', [0.6, 2.5])
+@pytest.mark.parametrize('restarts', [True, False])
+def test_autopilot_shows_the_motion_while_odometry_pauses(pause, restarts):
+    gate = fly(Gate(LIMITS), 10.0)
+    for now in np.arange(10.0, 25.0 + pause, 0.05):
+        x = 0.5 * min(now - 10.0, 14.0)  # a stop during the pause
+        gate.take_motion('autopilot', MotionReport(
+            [0.5 * (now < 24.0), 0.0, 0.0], 0.0, [x + 7.0, 3.0, 2.0]), 0.0, now)
+        if not 23.8 < now < 23.8 + pause:
+            origin = 6.5 if restarts and now > 23.8 else 0.0
+            gate.take_motion('odom', MotionReport(
+                [0.5 * (now < 24.0), 0.0, 0.0], 0.0, [x - origin, 0.0, 2.0]), 0.0, now)
+        decide(gate, now)
+    assert gate.place(now).offset[0] == pytest.approx(7.0, abs=0.1)
+
+
 def test_motion_while_odometry_pauses_is_no_jump():
     gate = fly(Gate(LIMITS), 10.0)
     x, now = along(gate, 'odom', 0.0, 2.0, 10.0, 5.0)

@@ -41,6 +41,7 @@ PILOT = VehicleStatus(True, 'POSCTL', False)
 # Events: the name of the transition, and its arguments.
 ASKED = 'request', 1.0
 ENDED = 'end', 'hold requested'
+MOVED = 'end', STICK.text, Cause.STICK
 REBOOTED = 'reset', 'the autopilot rebooted'
 SECOND = 'contest', '/planner, /other'
 LANDED = 'land',
@@ -104,6 +105,22 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
     assert failed.name_taker(takeover.PILOT, 16.0).taken_over(25.9)  # a later pilot
     assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
+
+
+@pytest.mark.parametrize('events', [
+    (), (ENDED,), (('end', 'low battery'), seen(PILOT, 5.0)), (('fall_silent', 'no velocity'),),
+    (ENDED, ('fall_silent', 'no velocity')), (LANDED,), (seen(DISARMED, 5.0),)])
+def test_nothing_but_a_request_undoes_a_moved_stick(events):
+    permission = after(ASKED, seen(OURS, 5.0), MOVED, *events)
+    assert permission.taken_over(14.9).startswith('the pilot took over')
+    assert not permission.taken_over(15.0)
+    assert not next_permission(permission, ('request', 15.0)).taken_over(15.0)
+
+
+def test_a_request_hides_no_possible_takeover_by_the_pilot():
+    lost = after(ASKED, seen(OURS), ('follow_silence', 5.1), ENDED)
+    assert lost.announcement() == 'READY: giving back: hold requested'
+    assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
 
 
 @pytest.mark.parametrize(('events', 'flies'), [
@@ -187,7 +204,7 @@ def test_long_silence_may_hide_a_takeover_and_return():
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
 EVENTS = [('request', 1.0), ('follow_silence', 5.1), ('fall_silent', 'no velocity'),
-          ('fail', 'late'), LANDED, ENDED, REBOOTED, SECOND,
+          ('fail', 'late'), LANDED, ENDED, MOVED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]
 

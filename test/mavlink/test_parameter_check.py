@@ -34,7 +34,7 @@ from flock_follower.mavlink.parameter_check import (
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 A, B, C = (Recommendation(name, value, f'why {name}') for name, value in (
     ('A', 1.0), ('B', 0.5), ('C', -3.0)))
-NEEDED = [rule.name for dialect in DIALECTS.values() for rule in dialect.rules]
+NEEDED = [rule.name for dialect in DIALECTS.values() for rule in dialect.offboard_rules]
 BOTH = pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
 ALLOWED = {
     'px4': {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'EKF2_EV_CTRL': 13},
@@ -107,7 +107,7 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     assert all(not entry.differs(entry.value) for entry in more)
     # Without forwarded odometry PX4 holds, with it it lands; nothing recommended forbids offboard.
     assert {entry.name: entry.value for entry in always}.get('COM_OBL_RC_ACT', 5) == 5
-    assert {rule.name for rule in dialect.rules} <= set(values)
+    assert {rule.name for rule in dialect.offboard_rules} <= set(values)
     assert obstacle(dialect, checked(needed=NEEDED, **values), True) == ''
 
 

@@ -54,7 +54,7 @@ def moved_after(samples, rest=REST, make=manual_control, threshold=0.3):
     watch.begin(0.05)
     for number, sticks in enumerate(samples, 1):
         watch.take(make(Sticks(*sticks)), number / RATE)
-        if watch.moved:
+        if watch.has_moved:
             return number / RATE
     return None
 
@@ -138,11 +138,11 @@ def test_a_lost_transmitter_takes_nothing_over(lost):
     for now in np.arange(0.1, 5.0, 0.1):
         watch.take(*(lost(Sticks(0.9, 0.9, 0.9, 0.0))[0], now), lost(REST)[1])
     watch.take(rc_channels(REST), 5.0)
-    assert not watch.moved
+    assert not watch.has_moved
     watch.take(rc_channels(Sticks(0.9, 0.0, 0.0, 0.0)), 5.1)
-    assert not watch.moved  # one message
+    assert not watch.has_moved  # one message
     watch.take(rc_channels(Sticks(0.9, 0.0, 0.0, 0.0)), 5.2)
-    assert watch.moved
+    assert watch.has_moved
 
 
 def test_an_invalid_manual_control_takes_nothing_over():
@@ -151,7 +151,7 @@ def test_an_invalid_manual_control_takes_nothing_over():
     watch.begin(0.05)
     for now in (0.1, 0.2, 0.3):
         watch.take(mavlink.MAVLink_manual_control_message(1, *[32767] * 4, 0), now)
-    assert not watch.moved
+    assert not watch.has_moved
 
 
 def test_messages_on_both_sides_of_a_gap_are_not_consecutive():
@@ -160,7 +160,7 @@ def test_messages_on_both_sides_of_a_gap_are_not_consecutive():
     for now, roll, moved in ((0.0, 0.0, False), (0.1, 0.9, False), (1.2, 0.9, False),
                              (1.3, 0.9, True)):
         watch.take(manual_control(REST._replace(roll=roll)), now)
-        assert watch.moved is moved, now
+        assert watch.has_moved is moved, now
 
 
 def test_receiver_values_do_not_count_beside_manual_control():
@@ -171,7 +171,7 @@ def test_receiver_values_do_not_count_beside_manual_control():
     watch.begin(1.0)
     for now in np.arange(1.0, 5.0, 0.1):  # MANUAL_CONTROL ends with the transmitter
         watch.take(rc_channels(Sticks(0.9, 0.9, 0.9, -1.0)), now)
-    assert not watch.moved
+    assert not watch.has_moved
 
 
 # Where it acts.
@@ -241,8 +241,24 @@ def test_on_116_px4_decides_about_sticks_by_itself():
 def test_no_program_undoes_a_stick_that_no_mode_has_answered():
     flight = Flight().follow(1.0)
     flight.bridge.housekeeping.parameters.take_version(version(1, 18))
-    flight.bridge.sticks.moved = True
+    flight.bridge.sticks.has_moved = True
     flight.fly(0.1)
     assert flight.bridge.gate.permission.phase is Phase.GIVING_BACK
     assert 'the pilot took over' in flight.bridge.requests.offboard_obstacle(flight.now)
     assert flight.kinds(1) == {'brake'}
+
+
+@pytest.mark.slow
+def test_the_end_of_the_bridge_does_not_undo_a_moved_stick():
+    flight = Flight().follow(1.0)
+    flight.controller._sticks = True
+    flight.bridge.housekeeping.parameters.take_version(version(1, 18))
+    flight.bridge.sticks.moved = True
+    while flight.mode != 'POSCTL':
+        flight.fly(0.01)
+    flight.bridge.stop(flight.now)
+    assert flight.bridge.gate.flies  # no HEARTBEAT has shown it yet
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(1.0)
+    assert flight.mode == 'POSCTL'

@@ -102,11 +102,11 @@ class Bench(Driven):
                   mavlink.MAVLink_local_position_ned_message(
                       0, 1.0, 2.0, -3.0, 0.4, 0.1, -0.2))
 
-    def odometry(self, yaw: float = 0.0, late: int = 0) -> None:
+    def odometry(self, yaw: float = 0.0, late: int = 0, height: float = 2.0) -> None:
         """Give odometry that has waited for some ns."""
         now = self.node.get_clock().now().nanoseconds - late
         self.node._own._take(to_odometry(
-            nanoseconds_to_stamp(now), 'odom', 'base_link', (0.0, 0.0, 2.0),
+            nanoseconds_to_stamp(now), 'odom', 'base_link', (0.0, 0.0, height),
             quaternion_from_yaw(yaw), (0.0, 0.0, 0.0)), now)
         self.node._hand_over_odom()
 
@@ -269,6 +269,24 @@ def test_it_publishes_estimate_battery_and_place_of_arming(make_bench):
     before = len(states)
     bench.wait(lambda: len(states) > before + 2)  # repeated, though nothing changed
     assert 'INACTIVE: offboard was not requested' in {state.data for state in states}
+
+
+def test_arming_place_is_unknown_without_odometry_or_after_jump(make_bench):
+    bench = make_bench()
+    places = bench.sent['mavlink_bridge/armed_at']
+
+    def arm():
+        for armed in (False, True):
+            bench.beat(armed=armed)
+            bench.wait(lambda armed=armed: bench.bridge.telemetry.status is not None and (
+                bench.bridge.telemetry.status.armed is armed))
+    for count, (act, height) in enumerate((
+            (arm, math.nan), (lambda: (bench.odometry(), arm()), 2.0),
+            (lambda: (bench.odometry(height=0.1), bench.beat()), math.nan),
+            (lambda: (bench.odometry(height=0.1), arm()), 0.1)), 1):
+        act()
+        bench.wait(lambda count=count: len(places) == count)
+        assert places[-1].point.z == pytest.approx(height, nan_ok=True)
 
 
 def test_odometry_keeps_its_age_on_arrival_however_long_queued(make_bench):

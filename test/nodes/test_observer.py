@@ -31,7 +31,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from flock_follower.checks.collector import POSES
-from flock_follower.nodes.observer import DISCOVERY, Observer, processes, SIMULATOR
+from flock_follower.nodes.observer import DISCOVERY, find_processes, Observer, SIMULATOR
 from flock_follower.topic_names import OURS
 
 
@@ -83,7 +83,7 @@ def test_foreign_poses_are_taken_once_parameters_are_read(
 def test_the_simulator_is_no_other_program() -> None:
     with subprocess.Popen([sys.executable, '-', 'flock_desk.simulator_node'],
                           stdin=subprocess.PIPE) as simulator:
-        ours, with_simulator = ({process for process, *_ in processes(names)}
+        ours, with_simulator = ({process for process, *_ in find_processes(names)}
                                 for names in (OURS, (*OURS, *SIMULATOR)))
         assert simulator.stdin is not None
         simulator.stdin.close()

@@ -17,13 +17,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import math
 import time
 from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from driven import Driven, overrides, START, to_odometry
-from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
+from geometry_msgs.msg import AccelWithCovarianceStamped, Point, PointStamped
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo
@@ -186,6 +187,8 @@ def test_every_other_input_arrives_unknown_ones_are_counted(rig: Rig) -> None:
     rig.give('neighbors/acceleration', push)
     rig.run(0.1)
     assert rig.node._loop.ground == 0.4
+    rig.give('mavlink_bridge/armed_at', PointStamped(point=Point(z=math.nan)))
+    assert rig.node._loop.ground is None
     assert 0.0 < rig.node._loop.memory.motions['leader'].acceleration[0] <= 0.3  # smoothed
     assert rig.values['leader_is'] == 'leader, seen' and rig.values['edges'] == 'leader'
     assert (rig.values['nearest_m'], rig.values['farthest_m']) == ('1.000', '2.828')

@@ -118,16 +118,16 @@ def test_two_publishers_are_refused_until_one_is_left(
     r.odom(0.0)
     r.odom(0.1)
     ends['/poses'] *= 2
-    r.node._sources.look()
+    r.node._sources.subscribe_available()
     r.give('poses', pose(0.05))
     assert not r.found and r.counters[TWO_PUBLISHERS] == 1
     assert '2 publishers' in r.problems()
     del ends['/poses'][1]
-    r.node._sources.look()
+    r.node._sources.subscribe_available()
     r.give('poses', pose(0.06))
     assert len(r.found) == 1
     ends['/poses'].clear()  # a publisher that has just begun again is not found yet
-    r.node._sources.look()
+    r.node._sources.subscribe_available()
     r.give('poses', pose(0.07))
     assert len(r.found) == 2 and r.counters[TWO_PUBLISHERS] == 1
 
@@ -192,7 +192,7 @@ def test_a_topic_of_another_type_is_reported(
 def test_topic_of_frames_without_a_header_is_reported(
         rig: Callable[..., Rig], ends: dict[str, list[str]]) -> None:
     ends['/camera_info'] = ['std_msgs/msg/String']
-    assert 'frames_topic /camera_info holds std_msgs/msg/String' in rig().problems()
+    assert 'frames_topic /camera_info has type std_msgs/msg/String' in rig().problems()
 
 
 def test_a_transform_needs_tf2_msgs(rig: Callable[..., Rig]) -> None:

@@ -348,6 +348,9 @@ def test_the_child_frame_of_odom_is_placed_by_tf_static(
                                T_odom_imu.quaternion, np.zeros(3)))
     r.image(0.0, image)
     np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
+    r.odom(0.1, velocity=np.zeros(3))  # of base_link: the source was replaced
+    r.image(0.1, image)
+    np.testing.assert_allclose(from_odometry(r.found[1]).position, LEADER.translation, atol=0.03)
 
 
 def test_motion_without_odometry_places_neighbor_in_own_frame(

@@ -145,6 +145,26 @@ def test_invalid_or_large_message_is_counted_node_goes_on(rig: Rig) -> None:
     assert rig.show()['own'] is None
 
 
+def test_bytes_that_are_no_message_are_invalid_page_goes_on(rig: Rig) -> None:
+    rig.show()
+    for topic in ('planner/state', 'image_raw'):
+        next(s for s in rig.node.subscriptions if s.topic_name == f'/one/{topic}').callback(b'??')
+    shown = len(rig.pages.states)
+    rig.show()
+    assert len(rig.pages.states) == shown + 1
+    assert rig.counters == {'invalid planner/state': 1, 'invalid image': 1}
+
+
+def test_covariance_that_no_ellipsoid_has_leaves_the_page(rig: Rig) -> None:
+    rig.show()
+    rig.place('odom', 'base_link', (1.0, 2.0, 3.0))
+    rig.give('neighbors/heard', to_odometry(
+        nanoseconds_to_stamp(STAMP), 'odom', 'leader', (3.0, 2.0, 3.0), IDENTITY_QUATERNION,
+        STILL, STILL, 1.7e308 * np.ones((6, 6)), np.eye(6)))
+    shapes = {shape['n'] for shape in rig.show()['scene']}
+    assert 'leader' in shapes and 'leader covariance' not in shapes
+
+
 @pytest.mark.parametrize('compressed', [False, True])
 def test_the_estimate_is_drawn_where_the_camera_sees_it(rig: Rig, compressed: bool) -> None:
     if compressed:

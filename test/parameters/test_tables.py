@@ -120,4 +120,7 @@ def test_a_user_without_a_home_folder_has_a_folder_of_recordings(
 
 
 def test_the_names_of_flight_parameters_are_those_of_the_tables() -> None:
-    assert {spec.name for specs in TABLE.values() for spec in specs} == FLIGHT_NAMES
+    declared = {spec.name for specs in TABLE.values() for spec in specs}
+    assert declared == FLIGHT_NAMES, (
+        f'parameters/flight_names.py: add {sorted(declared - FLIGHT_NAMES)}, '
+        f'remove {sorted(FLIGHT_NAMES - declared)}')

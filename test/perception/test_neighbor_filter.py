@@ -266,14 +266,14 @@ def test_a_contradicted_attitude_is_dropped_within_0_3_s(rate: float, images: in
 
 
 @pytest.mark.parametrize(('t', 'outcome'), [
-    (1.9, UpdateOutcome.LATE), (2.0, UpdateOutcome.LATE), (3.0, UpdateOutcome.USED),
+    (1.9, UpdateOutcome.OLDER), (2.0, UpdateOutcome.OLDER), (3.0, UpdateOutcome.USED),
     (4.5, UpdateOutcome.STARTED), (0.1, UpdateOutcome.STARTED)])  # a gap; a jump back in time
 def test_late_and_repeated_frames_are_dropped_jumps_restart(
         t: float, outcome: UpdateOutcome) -> None:
     tracker = tracked(2.0)
     before = now(tracker, 2.0)
     assert update(tracker, t, truth(t)) is outcome
-    if outcome is UpdateOutcome.LATE:
+    if outcome is UpdateOutcome.OLDER:
         np.testing.assert_array_equal(now(tracker, 2.0).position, before.position)
     if outcome is UpdateOutcome.STARTED:
         np.testing.assert_allclose(now(tracker, t).position, truth(t).translation, atol=1e-9)

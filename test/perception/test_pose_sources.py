@@ -151,6 +151,17 @@ def test_a_bad_pose_is_refused_by_its_reason(changes: dict[str, Any], reason: st
     assert not [*perceiver.sources.due(0.0)]
 
 
+@pytest.mark.parametrize('place', [own_pose(0.5).translation, [101.5, 0.0, 1.0]])
+@pytest.mark.parametrize('only', [False, True])
+def test_pose_in_odom_at_own_place_or_too_far_is_refused(place: Any, only: bool) -> None:
+    perceiver = started(config(position_only=only))
+    seconds(perceiver, 0.0, 1.0)
+    wrong = pose(0.5, 'odom')._replace(position=np.array(place))
+    assert perceiver.take_pose('leader', wrong, 0.0) is None  # own place: not known before
+    assert [each[0] for each in perceiver.sources.due(0.0) if not isinstance(each, int)] == [
+        pose_sources.INVALID]
+
+
 def test_repeated_stamp_and_pose_without_odometry_are_refused() -> None:
     perceiver = started()
     assert perceiver.take_pose('leader', pose(0.5), 0.0) == (pose_sources.UNPLACED, 'leader')

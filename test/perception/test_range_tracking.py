@@ -185,7 +185,7 @@ def test_a_distance_corrects_what_is_along_the_line_only() -> None:
     for k in (1, 2, 4, 5):
         assert after.covariance[k, k] == pytest.approx(before.covariance[k, k], rel=0.06)
     assert after.covariance[0, 0] < 0.01
-    assert tracker.update_range(0.5, 2.4, np.zeros(3), 0.01) is UpdateOutcome.LATE
+    assert tracker.update_range(0.5, 2.4, np.zeros(3), 0.01) is UpdateOutcome.OLDER
     assert tracker.update_range(9.0, 2.4, np.zeros(3), 0.01) is UpdateOutcome.LOST
     assert NeighborFilter().update_range(0.0, 2.0, np.zeros(3), 0.01) is UpdateOutcome.LOST
 

@@ -34,7 +34,7 @@ AHEAD = 0.16  # s from an image's stamp to the newest odometry when it is proces
 
 
 class Own(NamedTuple):
-    """The true motion of the own vehicle: it rolls, pitches and yaws a little."""
+    """The true motion of the ego vehicle: it rolls, pitches and yaws a little."""
 
     shaking: float = 1.0
 
@@ -136,7 +136,7 @@ def test_a_state_is_moved_as_the_offset_moves_it() -> None:
         track.update(k * DT, Transform(translation=np.array([2.0, 0.0, 0.0])), np.zeros(3),
                      1e-6 * np.eye(6))
     before = known(track.newest)
-    track.shift(0.02 * moving, 0.02)
+    track.add_error(0.02 * moving, 0.02)
     after = known(track.newest)
     assert after.stamp == pytest.approx(before.stamp + 0.02)
     np.testing.assert_allclose(after.position - before.position, 0.02 * moving[POSITION])

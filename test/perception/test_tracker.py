@@ -47,7 +47,7 @@ from flock_follower.perception.tracker import (
 
 CAMERA = make_camera()
 MOUNTING = camera_mounting([0.10, 0.0, 0.02], [0.0, 0.1, 0.0])  # looking 6 deg down
-# The own pose, with a little roll and pitch, facing north; the leader's, ahead and turned left.
+# The ego pose, with a little roll and pitch, facing north; the leader's, ahead and turned left.
 OWN = Transform.from_quaternion([0.0, 0.0, 1.0], quaternion_from_rpy(0.05, -0.03, np.pi / 2))
 LEADER = Transform.from_quaternion([0.3, 2.2, 1.1], quaternion_from_rpy(0.0, 0.1, np.pi / 2 + 0.3))
 VELOCITY = np.array([0.4, 1.2, -0.1])
@@ -55,7 +55,7 @@ EMPTY = render(CAMERA, {})
 
 
 def own(stamp: float, jump: Array | float = 0.0) -> OdometrySample:
-    """Return the own odometry of a flight that is at OWN at stamp 0."""
+    """Return the ego odometry of a flight that is at OWN at stamp 0."""
     return OdometrySample(stamp, OWN.translation + stamp * VELOCITY + jump, OWN.quaternion,
                           VELOCITY, np.zeros(3))
 

@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.gate.disturbance import HeightWatch
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.vertical_yaw import (
@@ -60,9 +61,9 @@ def flown(seconds: float, leads: Callable[[float], tuple[float, float]] = lambda
           params: PlannerParams = PARAMS, first: float = 2.0, late: int = 0
           ) -> Iterator[tuple[Altitude, float, float]]:
     """
-    Yield the altitude held, the own height and climb at every tick.
+    Yield the altitude held, the ego height and climb at every tick.
 
-    :param leads: height and climb of the leader at a time; :param first: own height at first.
+    :param leads: height and climb of the leader at a time; :param first: ego height at first.
     :param late: periods after which a command is flown.
     """
     altitude, height, speed = Altitude.begin(me(first), 0.0, params), first, 0.0
@@ -166,14 +167,20 @@ def test_bounds_that_change_in_flight_count_at_once(
     assert bounded.with_limits_of(params) is bounded
 
 
-def test_a_ceiling_lowered_in_flight_is_obeyed() -> None:
-    follower = Follower()
+@pytest.mark.parametrize(('mode', 'limits', 'height'), [
+    ('follow', {'altitude_max': 2.5}, 2.4), ('hold', {'altitude_max': 2.5}, 2.4),
+    ('hold', {'altitude_max': 1.5}, 1.4), ('hold', {'altitude_min': 5.0}, 5.1)])
+def test_bounds_changed_in_flight_are_obeyed_without_handover(
+        mode: str, limits: dict[str, float], height: float) -> None:
+    follower, watch = Follower(replace(PARAMS, altitude_mode=mode)), HeightWatch()
     follower.position[2] = 3.0
     for tick in range(150):
         if tick == 20:
-            follower.params = replace(follower.params, altitude_max=2.5)
-        follower.tick(seen(follower.now, (2.12, 0.0, 3.0)))
-    assert follower.position[2] == pytest.approx(2.4, abs=0.05)
+            follower.params = replace(follower.params, **limits)  # type: ignore[arg-type]
+        decision = follower.tick(seen(follower.now, (2.12, 0.0, 3.0)))
+        watch.step(float(follower.position[2]), decision.altitude)
+        assert not watch.reason
+    assert follower.position[2] == pytest.approx(height, abs=0.05)
 
 
 def test_behind_a_leader_that_climbs_steadily_nothing_lags() -> None:

@@ -32,7 +32,7 @@ from flock_follower.planner.bound_keeping import Bound
 from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import in_sight
 from flock_follower.planner.guard import (
-    climb_range,
+    climb_rates,
     fences,
     limit_to_retreat,
     sort_bounds,
@@ -173,19 +173,19 @@ OWN = own(0.0, np.zeros(3))
 
 def test_it_neither_climbs_into_one_above_nor_sinks_onto_one() -> None:
     still = [0.0, 0.0, 0.0]
-    assert climb_range([near([0.1, 0.0, 0.8], still)], OWN, PARAMS)[1] < -0.2
-    least, most = climb_range([near([0.1, 0.0, 1.2], still)], OWN, PARAMS)
+    assert climb_rates([near([0.1, 0.0, 0.8], still)], OWN, PARAMS)[1] < -0.2
+    least, most = climb_rates([near([0.1, 0.0, 1.2], still)], OWN, PARAMS)
     assert most == 0.0 and math.isinf(least)
-    assert climb_range([near([0.1, 0.0, -1.2], still)], OWN, PARAMS)[0] == pytest.approx(-most)
-    assert climb_range([near([0.1, 0.0, 1.2], [0.0, 0.0, -0.5])], OWN, PARAMS)[
+    assert climb_rates([near([0.1, 0.0, -1.2], still)], OWN, PARAMS)[0] == pytest.approx(-most)
+    assert climb_rates([near([0.1, 0.0, 1.2], [0.0, 0.0, -0.5])], OWN, PARAMS)[
         1] == pytest.approx(-0.5)
-    assert climb_range([near([1.4, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
+    assert climb_rates([near([1.4, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
 
 
 def test_climb_keeps_height_that_slant_distance_needs() -> None:
     level, height = 0.5, 0.8  # |r| = 0.94 m, less than sqrt(d0) = 1 m
     too_near = height - math.sqrt(1.0 - level ** 2)
-    assert climb_range([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[
+    assert climb_rates([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[
         1] == pytest.approx(PARAMS.guarding.closing_speed(too_near)[0])
 
 
@@ -194,27 +194,27 @@ def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:
     for height in (0.8, -0.8):
         up = math.copysign(1.0, height)
         coming = near([0.05, 0.0, height], [-0.2, 0.0, -0.3 * up])
-        assert climb_range([coming], OWN, params) == pytest.approx((-0.6 * up, -0.6 * up), abs=0.1)
+        assert climb_rates([coming], OWN, params) == pytest.approx((-0.6 * up, -0.6 * up), abs=0.1)
 
 
 def test_the_height_between_is_that_of_hulls() -> None:
     params = PlannerParams(v_max=0.5, radius=0.3)
     still = near([0.1, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)
-    assert climb_range([still], OWN, params)[1] < -0.2
+    assert climb_rates([still], OWN, params)[1] < -0.2
     aside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0], 0.3)
-    assert climb_range([aside], OWN, params)[1] < 0.4
+    assert climb_rates([aside], OWN, params)[1] < 0.4
 
 
 def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     params = PlannerParams(v_max=0.5)
-    assert climb_range([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
+    assert climb_rates([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (-0.3, 0.3))
     # Backing away from one that hovers too near takes its part, too.
     backing = own(0.0, np.zeros(3), (-0.4, 0.0, 0.0))
-    assert climb_range([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing,
+    assert climb_rates([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing,
                        params) == pytest.approx((-0.3, 0.3))
     # Nearer than it should be, it returns by 0.4 m/s more, and does not climb meanwhile.
-    assert climb_range([near([0.9, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
+    assert climb_rates([near([0.9, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (0.0, 0.0))
-    assert climb_range([near([1.8, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
+    assert climb_rates([near([1.8, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
         -math.inf, math.inf)

@@ -204,3 +204,6 @@ def test_height_at_arming_is_unknown_after_odometry_jump() -> None:
         loop.take_odometry(own(now)._replace(position=np.array([0.0, 0.0, height])), now)
         loop.tick(now, PARAMS)
         assert loop.ground == ground
+    loop.ground = 3.4
+    fly(loop, START - HOUR)  # the simulation began again
+    assert loop.ground is None

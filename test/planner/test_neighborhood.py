@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Neighbor selection: the own edges of the graph, and the neighbor that the vehicle faces."""
+"""Neighbor selection: the edges of one vehicle, and the neighbor that it faces."""
 
 from __future__ import annotations
 

@@ -393,8 +393,8 @@ def test_drag_does_not_keep_it_below_its_largest_speed() -> None:
 @pytest.mark.parametrize(('it', 'warning'), [
     (leader(0.0, (2.0, 0.0, 2.0), (0.9, 0.0, 0.0)),
      'leader at 0.9 m/s, v_max 0.5 m/s: cannot keep up'),
-    (leader(0.0, (0.8, 0.0, 2.0)), 'leader 0.80 m away, the band begins at 1.00 m: too close'),
-    (leader(0.0, (3.2, 0.0, 2.0)), 'leader 3.20 m away, the band ends at 2.83 m: too far'),
+    (leader(0.0, (0.8, 0.0, 2.0)), 'leader is too close: 0.80 m, the band begins at 1.00 m'),
+    (leader(0.0, (3.2, 0.0, 2.0)), 'leader is too far: 3.20 m, the band ends at 2.83 m'),
 ])
 def test_a_motion_beyond_its_means_is_a_warning(it: Neighbor, warning: str) -> None:
     assert decide(0.0, it).warnings == (warning,)

@@ -103,7 +103,7 @@ def test_the_law_and_the_guard_act_between_hulls() -> None:
     assert decision.warnings == ()
     closer = seen('leader', 0.0, 2.1)
     assert decide(closer, params=guarded)[1].warnings == (
-        'leader 0.90 m away, the band begins at 1.00 m: too close',)
+        'leader is too close: 0.90 m, the band begins at 1.00 m',)
     assert 'separation' not in decide(near, params=PlannerParams())[1].limits
 
 
@@ -122,4 +122,4 @@ def test_listed_vehicle_neither_seen_nor_received_is_reported() -> None:
     for around, missing in (([leader, beside], 'b'), ([leader, received], 'b'),
                             ([leader], 'ab')):
         assert decide(*around, params=params)[1].warnings == tuple(
-            f'{name} neither seen nor received, not kept clear of' for name in missing)
+            f'{name} neither seen nor received: no distance to it is kept' for name in missing)

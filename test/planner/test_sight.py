@@ -280,3 +280,21 @@ def test_it_brakes_at_once_and_follows_again() -> None:
             assert abs(follower.velocity[0]) < 0.15
     assert states[:10] == [State.TRACK] * 10 and states[10:20] == [State.HOLD] * 10
     assert State.TRACK in states[20:23] and states[-1] is State.TRACK
+
+
+def test_one_image_that_shows_it_again_ends_the_retreat() -> None:
+    """Its place is known again; three images end the occlusion."""
+    follower, place = Follower(PlannerParams(v_max=2.0)), (1.8, 0.0, 2.0)
+    stamps = list[float]()
+    for tick in range(30):
+        stamps.append(follower.now)
+        back = max(tick - 23, 0)
+        shown = [seen(follower.now, place)] if tick < 10 or back > 0 else []
+        decision = follower.tick(
+            *shown, looked=follower.now, view=AHEAD, frames=stamps[-20:])
+        if tick == 23:
+            assert decision.state is State.HOLD and follower.velocity[0] < -0.5
+        if back in (1, 2):
+            assert decision.state is State.HOLD
+            assert decision.acceleration is not None and decision.acceleration[0] > 1.5
+    assert decision.state is State.TRACK

@@ -34,7 +34,8 @@ ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 @pytest.mark.ros
 def test_the_parameter_page_is_that_of_the_nodes():
     from flock_desk.program import markdown
-    assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown()
+    assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown(), (
+        'run: python -m flock_desk.program --parameters > config/PARAMETERS.md')
 
 
 FOLDERS = 'benchmarks|config|bags|deploy|docs|examples|launch|test|requirements|flock_follower'
@@ -109,9 +110,11 @@ def test_every_module_on_the_page_of_the_house_exists():
         assert (ROOT / 'flock_follower' / name).exists() or (ROOT / name).exists(), name
 
 
-def test_path_of_an_image_is_through_existing_functions():
+@pytest.mark.parametrize(('header', 'counted'), [
+    ('| file | functions, in the order', True), ('| file | functions for a lost leader', False)])
+def test_path_of_an_image_is_through_existing_functions(header, counted):
     text = ARCHITECTURE.read_text()
-    table = text.partition('| file | functions')[2].partition('\n\n')[0]
+    table = text.partition(header)[2].partition('\n\n')[0]
     functions, files = set(), set()
     for row in table.splitlines()[2:]:
         paths, names = (re.findall(r'`([^`]+)`', cell) for cell in row.split('|')[1:3])
@@ -122,7 +125,8 @@ def test_path_of_an_image_is_through_existing_functions():
             assert name.rpartition('.')[2] in defined, f'{name} in {paths}'
             functions.add((paths[0], name))
         files.update(paths)
-    assert f'{len(functions)} functions in {len(files)} files' in text
+    assert len(functions) > 5
+    assert not counted or f'{len(functions)} functions in {len(files)} files' in text
 
 
 def test_the_example_for_kalibr_prints_what_the_page_says(capsys):

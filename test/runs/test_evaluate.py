@@ -290,13 +290,13 @@ INFO = 'sensor_msgs/msg/CameraInfo'
      'no message on /image_raw or /image_raw/compressed; it holds /camera_info, /odom'),
     ({'/image_raw': IMAGE, '/ov/odomimu': ODOMETRY}, {},
      'no message on /camera_info; no message on /odom; it holds /image_raw, /ov/odomimu; '
-     '/ov/odomimu holds nav_msgs/msg/Odometry: --remap odom:=/ov/odomimu'),
+     '/ov/odomimu has type nav_msgs/msg/Odometry: --remap odom:=/ov/odomimu'),
     ({'/image_raw': ODOMETRY, '/camera_info': INFO, '/odom': ODOMETRY}, {},
-     '/image_raw holds nav_msgs/msg/Odometry, not sensor_msgs/msg/Image; '),
+     '/image_raw has type nav_msgs/msg/Odometry, not sensor_msgs/msg/Image; '),
     # Images that are named are not replaced by others.
     ({'/image_raw': IMAGE, '/camera_info': INFO, '/odom': ODOMETRY}, {'image_raw': '/cam/image'},
      'no message on /cam/image; it holds /image_raw, /camera_info, /odom; '
-     '/image_raw holds sensor_msgs/msg/Image: --remap image_raw:=/image_raw')])
+     '/image_raw has type sensor_msgs/msg/Image: --remap image_raw:=/image_raw')])
 def test_missing_or_mistyped_topics_are_named_with_candidates(
         types: dict[str, str], remaps: dict[str, str], message: str) -> None:
     bag: Any = SimpleNamespace(path='bag', topics={

@@ -41,7 +41,7 @@ CAMERA = CameraModel(np.array([[610.0, 0, 319.5], [0, 610.0, 239.5], [0, 0, 1]])
                      'plumb_bob', 640, 480)
 AHEAD = np.array([2.0, 0.3, 0.1])
 VELOCITY = np.array([0.5, -0.2, 0.0])
-BIAS = np.array([0.03, 0.0, -0.02])  # of the own velocity
+BIAS = np.array([0.03, 0.0, -0.02])  # of the ego velocity
 #: Deviations along the axes of odom before it drifts.
 POSITION_SIGMA = np.array([0.01, 0.02, 0.03])
 VELOCITY_SIGMA = np.array([0.05, 0.10, 0.02])
@@ -76,7 +76,7 @@ def collected(frames: int = 10, *, drift: float = 0.0, turned: float = 0.0, nois
     for k in range(frames):
         stamp = k * SECOND // 20
         place = VELOCITY * k / 20
-        # An error of the own velocity that lasts is in the leader's, too.
+        # An error of the ego velocity that lasts is in the leader's, too.
         errors.odometry(state(stamp, R @ place, drift, R @ (VELOCITY + BIAS)))
         errors.truth(state(stamp, place), own=True)
         errors.truth(state(stamp, place + ahead, leader_yaw, child='leader'))

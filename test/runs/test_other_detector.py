@@ -113,7 +113,7 @@ def values(folder: Path, more: str = '') -> dict[str, dict[str, Any]]:
 
 def judged(folder: Path, faults: Faults, more: str = '') -> tuple[Evaluation, dict[str, float]]:
     evaluation = evaluate(recorded(folder, faults), values(folder, more), folder / 'result.mcap',
-                          checked=False)
+                          with_check=False)
     table = evaluation.tables['leader']
     seen = np.isfinite(table['nees_position']) & (table['time'] > 1.0)
     figures = {

@@ -36,7 +36,7 @@ def played(folder: Path, seconds: float, change: Change) -> Evaluation:
     # The bag is too short to find out the frame of the twist.
     values = parse_parameters({'/**': {'ros__parameters': {'odom_twist_frame': 'child'}}}, TABLE)
     return evaluate(excerpt(folder / 'bag', seconds, change), values, folder / 'result.mcap',
-                    checked=False)
+                    with_check=False)
 
 
 def stops(topic: str, after: float) -> Change:

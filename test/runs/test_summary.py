@@ -121,7 +121,7 @@ def test_a_hold_is_told_with_its_length_and_reason() -> None:
     assert figures['planner'] == {'hold_count': 3, 'hold_s': pytest.approx(3.6)}
     assert figures['holds'] == {
         'at_4.0_s': '2.5 s: no neighbor seen for 2.5 s',
-        'at_7.0_s': '0.1 s: too short for its reason to be on /diagnostics',
+        'at_7.0_s': '0.1 s: too short: its reason was not published on /diagnostics',
         'at_9.0_s': '1.0 s: odometry too old'}
     assert hold_figures([], [], 1.0) == {'planner': {'hold_count': 0, 'hold_s': 0.0}, 'holds': {}}
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
+import contextlib
 import json
 import re
 import socket
@@ -28,7 +29,7 @@ import aiohttp
 import pytest
 
 from flock_follower.view.access import Access
-from flock_follower.view.server import FILES, PAGES_MAX, PageServer, STATIC
+from flock_follower.view.server import CONNECTIONS_MAX, FILES, PAGES_MAX, PageServer, STATIC
 
 TIMEOUT = aiohttp.ClientTimeout(total=20.0)
 
@@ -235,6 +236,47 @@ def test_no_more_pages_than_the_limit_are_open(rig: Rig) -> None:
             return error.status
         return 0
     assert rig.run(ask) == 503
+
+
+@pytest.mark.parametrize('said', [b'', b'GET / HTTP/1.1\r\n'])
+def test_a_connection_that_opens_no_page_ends(monkeypatch: pytest.MonkeyPatch, rig: Rig,
+                                              said: bytes) -> None:
+    monkeypatch.setattr('flock_follower.view.server.CONNECTION_TIME', 0.2)
+
+    async def ask(session: aiohttp.ClientSession) -> dict[str, Any]:
+        page = await session.ws_connect(f'{rig.origin}/ws', headers={'Origin': rig.origin})
+        reader, writer = await asyncio.open_connection('127.0.0.1', rig.server.port)
+        writer.write(said)
+        with contextlib.suppress(ConnectionResetError):
+            assert await asyncio.wait_for(reader.read(), 10.0) == b''
+        writer.close()
+        await page.receive_json()  # about; the page was open for longer
+        rig.server.send_history({})
+        shown: dict[str, Any] = await page.receive_json()
+        return shown
+
+    assert rig.run(ask) == {'history': {}}
+
+
+def test_connections_beyond_the_limit_end_the_oldest_one(rig: Rig) -> None:
+    async def ask(session: aiohttp.ClientSession) -> tuple[int, bytes]:
+        page = await session.ws_connect(f'{rig.origin}/ws', headers={'Origin': rig.origin})
+        idle = [await asyncio.open_connection('127.0.0.1', rig.server.port)
+                for _ in range(CONNECTIONS_MAX + 1)]
+        try:
+            ended = await asyncio.wait_for(idle[0][0].read(), 10.0)
+        except ConnectionResetError:
+            ended = b''
+        async with session.get(rig.origin) as reply:  # whoever holds sockets shuts out nobody
+            status = reply.status
+        await page.receive_json()
+        rig.server.send_history({})
+        assert await page.receive_json() == {'history': {}}
+        for _, writer in idle:
+            writer.close()
+        return status, ended
+
+    assert rig.run(ask) == (200, b'')
 
 
 def test_busy_port_and_foreign_address_are_errors_with_remedy() -> None:

@@ -27,7 +27,7 @@ from functools import partial
 import math
 from typing import Any
 
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import Point, PointStamped
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
@@ -41,7 +41,10 @@ from flock_follower.mavlink.status_texts import WARNING
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     from_state,
+    FUTURE_TOLERANCE,
     MOTION_TOPIC,
+    NANOSECONDS,
+    ODOMETRY_JUMP,
     OdometryState,
     set_vector,
     to_nanoseconds,
@@ -63,11 +66,13 @@ class BridgeReport:
     def __init__(self, node: FlockNode, bridge: Bridge, publisher: PublisherThread) -> None:
         self._node, self._diagnostics = node, node.diagnostics
         self._bridge, self._publisher = bridge, publisher
-        self.place: tuple[OdometryState, float] | None = None
-        """The newest odometry, and its time of arrival on the monotonic clock, s."""
+        self._place: tuple[OdometryState, float, int] | None = None
+        """The newest odometry, its time of arrival on the monotonic clock, s, and by how many
+        jumps its frame differs from the first."""
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._announced = ('', -math.inf)
         self._armed: bool | None = None
+        self._armed_frame: int | None = None  # of the place of arming; None: it is unknown
         self._active = False
         self._last_estimate = -math.inf
         self._lines: set[str] = set()  # that were logged
@@ -90,6 +95,13 @@ class BridgeReport:
     def refused(self, reason: str, detail: str) -> None:
         """Record a dropped input."""
         self._events.append(lambda: self._diagnostics.reject(reason, detail))
+
+    # The executor's thread.
+
+    def take_odometry(self, state: OdometryState, now: float) -> None:
+        """Take the newest odometry, received at ``now``, s, monotonic."""
+        before, _, frame = self._place or (state, now, 0)
+        self._place = state, now, frame + _changes_frame(before, state)
 
     # The setpoint thread.
 
@@ -120,7 +132,7 @@ class BridgeReport:
             self._publish(self._motions, lambda: self._odometry_message(*motion))
         if battery is not None and battery.time == now:
             self._publish(self._battery, lambda: self._battery_message(battery))
-        self._send_arming(now)
+        self._publish_arming_place(now)
 
     def _announce(self, now: float) -> None:
         """Publish the state; log its changes, what ended a flight, and the autopilot's texts."""
@@ -140,14 +152,20 @@ class BridgeReport:
             log = self._warn if text.severity <= WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
-    def _send_arming(self, now: float) -> None:
-        """Publish the place of arming by the odometry, if there is any."""
-        status, place = self._bridge.telemetry.status, self.place
-        if status is None or status.armed == self._armed:
+    def _publish_arming_place(self, now: float) -> None:
+        """Publish the place of arming by the odometry; NaN if it is not, or no longer, known."""
+        status, place = self._bridge.telemetry.status, self._place
+        if status is None:
             return
         begun, self._armed = self._armed is False and status.armed, status.armed
         if begun and place is not None and now - place[1] <= PLACE_TIMEOUT:
+            self._armed_frame = place[2]
             self._publish(self._armed_at, lambda: _point(place[0]))
+        elif begun or (place is not None and self._armed_frame not in (None, place[2])):
+            # The topic is latched: a planner that starts later must not take the old height.
+            self._armed_frame = None
+            self._publish(self._armed_at, lambda: PointStamped(point=Point(
+                x=math.nan, y=math.nan, z=math.nan)))
 
     def _send_estimate(self, state: OdometryState, valid: float) -> None:
         if valid <= self._last_estimate:
@@ -208,6 +226,14 @@ class BridgeReport:
                 (self._info if good else self._warn)(line)
         self._lines |= {*lines}
         return None
+
+
+def _changes_frame(before: OdometryState, after: OdometryState) -> bool:
+    """Return whether odometry has another frame than before, by ODOMETRY_JUMP."""
+    elapsed = (after.stamp - before.stamp) / NANOSECONDS
+    expected = before.position + 0.5 * elapsed * (before.velocity + after.velocity)
+    return after.frame != before.frame or elapsed < -FUTURE_TOLERANCE or (
+        math.dist(after.position, expected) > ODOMETRY_JUMP)
 
 
 def _point(state: OdometryState) -> PointStamped:

@@ -36,12 +36,12 @@ class ClockWatch:
     """
     Detects steps of the system clock, and messages that were stamped before the last step.
 
-    ``shift`` is the sum of all steps of the clock, ns: a stamp minus the shift is the time of a
-    clock without steps.
+    ``clock_shift`` is the sum of all steps of the clock, ns: a stamp minus that sum is the time
+    of a clock without steps.
     """
 
     def __init__(self) -> None:
-        self.shift = 0
+        self.clock_shift = 0
         self._offset: int | None = None  # of the system clock from the monotonic one, ns
         self._monotonic = -math.inf
         self._stepped = -math.inf  # when the last step was found, by the monotonic clock, s
@@ -58,7 +58,7 @@ class ClockWatch:
         step = 0 if before is None else self._offset - before
         if abs(step) <= LEAST_STEP * NANOSECONDS:
             return 0.0
-        self.shift += step
+        self.clock_shift += step
         self._stepped, self._first = monotonic, system - round((monotonic - last) * NANOSECONDS)
         return step / NANOSECONDS
 

@@ -24,8 +24,8 @@ class EvenClock(ClockWatch):
     """
     The time of a node, which does not jump if the system clock is set.
 
-    ``shift`` is the sum of all steps of the system clock, ns. With ``use_sim_time`` the time is
-    that of /clock, and every stamp is used.
+    ``clock_shift`` is the sum of all steps of the system clock, ns. With ``use_sim_time`` the time
+    is that of /clock, and every stamp is used.
     """
 
     def __init__(self, node: FlockNode) -> None:
@@ -40,11 +40,11 @@ class EvenClock(ClockWatch):
         system, monotonic = self._node.read_clocks()
         if step := self.take(system, monotonic):
             self._node.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
-        return system - self.shift
+        return system - self.clock_shift
 
     def dated(self, stamp: int, arrival: int) -> int:
         """Return a stamp of a message, ns, on this clock, and no later than its arrival."""
-        return stamp if self.simulated else min(stamp, arrival) - self.shift
+        return stamp if self.simulated else min(stamp, arrival) - self.clock_shift
 
     def fresh(self, topic: str, stamp: int) -> bool:
         """Return whether a stamp, ns, can be used; count it if made before a clock was set."""

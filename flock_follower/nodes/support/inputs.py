@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Inputs of the nodes: the own state from ``odom``, and static frames."""
+"""Inputs of the nodes: the ego state from ``odom``, and static frames."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def for_each(messages: Iterable[Any], take: Callable[[Any], None]) -> None:
 class NodeClock(Protocol):
     """A clock of a node that does not jump if the system clock is set: ``EvenClock``."""
 
-    shift: int
+    clock_shift: int
 
     def now(self) -> int:
         """Return the time, ns."""
@@ -78,6 +78,7 @@ class StaticChild:
 
     def __init__(self, node: Node) -> None:
         self.frames = StaticFrames()
+        self._placed = ''  # the child frame that was placed
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
@@ -112,13 +113,32 @@ class StaticChild:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""
         return None if child in ('', BASE) else self.frames.pose(child, BASE)
 
+    def place(self, source: OdometrySource, child: str) -> Transform | None:
+        """
+        Place the child frame of a source's messages; return its pose if that changed it.
+
+        A frame without a pose is taken as base_link, after another one, too.
+        """
+        if child == self._placed:
+            return None  # a static transform is passed once
+        pose = self.transform(child)
+        if pose is None and not self._placed:
+            return None
+        self._placed, pose = ('', Transform()) if pose is None else (child, pose)
+        source.place_child(pose)
+        return pose
+
+    def forget(self) -> None:
+        """Forget which frame was placed: the source is another one."""
+        self._placed = ''
+
 
 class OwnOdometry:
     """
     Subscribes ``odom``; counts dropped messages, and reports the frames in use.
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
-    :param use: is called with the own state, of base_link, and the arrival of its message, ns;
+    :param use: is called with the ego state, of base_link, and the arrival of its message, ns;
         both on the node's clock, or on ``clock`` if one is given.
     :raises ValueError: if a parameter is out of range.
     """
@@ -127,7 +147,7 @@ class OwnOdometry:
                  use: Callable[[OdometryState, int], None], clock: NodeClock | None = None,
                  depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
-        self._node, self._use, self._clock, self._placed = node, use, clock, ''
+        self._node, self._use, self._clock = node, use, clock
         self._found = ''  # the frame of the velocity that was logged
         node.diagnostics.checks.append(self._problem)
         node.diagnostics.sources.append(self._values)
@@ -137,26 +157,25 @@ class OwnOdometry:
         """Takes the messages that wait, see ``FlockNode.poll``."""
 
     def _take(self, message: Odometry, arrival: int) -> None:
-        child, shift = message.child_frame_id, 0
+        child, clock_shift = message.child_frame_id, 0
         if self._clock is not None:
             self._clock.now()
-            shift = self._clock.shift
+            clock_shift = self._clock.clock_shift
             if not self._clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
                 return
-        if self._static and child != self._placed and (
-                pose := self._static.transform(child)) is not None:
-            self._placed = child  # a static transform is passed once
-            self.source.place_child(pose)
-            self._node.get_logger().info(f'{child} is at {pose.translation.round(3).tolist()} m '
-                                         f'on {BASE} by tf_static')
-        state = self.source.take(message, arrival - shift, shift)
+        if self._static and (pose := self._static.place(self.source, child)) is not None:
+            known = self._static.transform(child) is not None
+            self._node.get_logger().info(
+                f'{child} is at {pose.translation.round(3).tolist()} m on {BASE} by tf_static'
+                if known else f'the child frame of odom, {child!r}, is taken as {BASE}')
+        state = self.source.take(message, arrival - clock_shift, clock_shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
         if self.source.twist.found != self._found:
             self._found = self.source.twist.found
             self._node.get_logger().info(f'velocity of odom: {self.source.twist.describe}')
         if state is not None:
-            self._use(state, arrival - shift)
+            self._use(state, arrival - clock_shift)
 
     def _values(self, now: float) -> dict[str, str]:
         source = self.source

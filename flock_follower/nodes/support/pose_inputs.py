@@ -86,8 +86,8 @@ class PoseInputs:
             self._subscribe_transforms(own_frames)
         perceiver.sources.static = StaticChild(node).frames
         node.diagnostics.checks.append(self._problem)
-        node.create_timer(LOOK_PERIOD, self.look, clock=STEADY)
-        self.look()
+        node.create_timer(LOOK_PERIOD, self.subscribe_available, clock=STEADY)
+        self.subscribe_available()
 
     def _subscribe_transforms(self, own_frames: frozenset[str]) -> None:
         if own := own_frames.intersection(self._transforms):
@@ -96,7 +96,7 @@ class PoseInputs:
         self._node.subscribe(message_class(TRANSFORMS), '/tf', self._take_transforms,
                              best_effort(100), required=False, largest=TRANSFORMS_BYTES_MAX)
 
-    def look(self) -> None:
+    def subscribe_available(self) -> None:
         """Subscribe the topics that have a publisher now; count the publishers of each."""
         for topic, name in self._names.items():
             ends = self._node.get_publishers_info_by_topic(topic)
@@ -110,7 +110,7 @@ class PoseInputs:
                 continue
             usable = next((each for each in POSE_TYPES if each in types), None)
             if usable is None:
-                self._waiting[topic] = f'holds {min(types)}'
+                self._waiting[topic] = f'has type {min(types)}'
                 continue
             self._node.subscribe(message_class(usable), topic, partial(self._take, topic, name),
                                  best_effort(10), required=False)
@@ -128,7 +128,7 @@ class PoseInputs:
         kind = message_class(msgtype)
         first = next(iter(kind.get_fields_and_field_types().values()), '')
         if first != 'std_msgs/Header' and msgtype != 'std_msgs/msg/Header':
-            raise ValueError(f'frames_topic {self._frames} holds {msgtype}: it has no header')
+            raise ValueError(f'frames_topic {self._frames} has type {msgtype}, without a header')
         # Raw: an image need not be read for its stamp.
         self._node.create_subscription(
             kind, self._frames, self._take_frame, QoSProfile(

@@ -126,7 +126,7 @@ def _start_ros(arguments: Sequence[str]) -> None:
 
     :raises RuntimeError: malformed ``--ros-args``.
     """
-    _load_type_support()
+    _skip_message_generator()
     # A node without a log flies better than none.
     reason = unwritable_logs(os.environ)
     silent = ['--ros-args', '--disable-external-lib-logs', '--'] if reason else []
@@ -140,7 +140,7 @@ def _start_ros(arguments: Sequence[str]) -> None:
         get_logger(LOGGER).warning(f'logs go to the terminal alone: {reason}')
 
 
-def _load_type_support() -> None:
+def _skip_message_generator() -> None:
     """
     Load the type support of messages without the generator of their Python code.
 

@@ -191,7 +191,7 @@ class FlockNode(Node):
                largest: int | None) -> Callable[[Any, Any], None]:
         """Return a function of a message, as bytes if its size is bounded, and its info."""
         watched = self.diagnostics.watch(topic, msg_type, qos, required, sporadic)
-        read = READERS.get(msg_type, functools.partial(_deserialize, msg_type))
+        read = READERS.get(msg_type, functools.partial(deserialize, msg_type))
 
         def take(message: Any, info: Any) -> None:
             watched.arrived()
@@ -268,7 +268,12 @@ class FlockNode(Node):
         self.diagnostics.internal_error(where, error)
 
 
-def _deserialize(msg_type: Any, data: bytes) -> Any:
+def deserialize(msg_type: Any, data: bytes) -> Any:
+    """
+    Return the message of its bytes.
+
+    :raises ValueError: if the bytes are none of that type.
+    """
     try:
         return deserialize_message(data, msg_type)
     except Exception as error:  # of the middleware, each of which has its own
