@@ -78,6 +78,8 @@ MAX_OFFSET: Final[float] = 0.2
 THRUST_OFFSET_MAX = 1.2
 #: Values of parameters that planner and gate have in common.
 A_MAX = Range(1.5, 20.0, 'm/s^2')
+#: Default of ``predict_timeout`` of the planner, s; ``check`` judges the gaps of poses by it.
+PREDICT_TIMEOUT: Final[float] = 0.5
 #: Below it gusts and the velocity error of odometry are as large as the limit.
 V_MAX = Range(0.1, 5.0, 'm/s')
 ODOM_TIMEOUT = Range(0.1, 1.0, 's')

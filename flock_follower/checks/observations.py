@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flock_follower.checks.pose_path import PosePath
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.geometry import Transform
@@ -146,7 +147,8 @@ class SourceSeen:
 
     ``topic`` is '' for a frame on /tf; ``frame`` is that of the newest pose. Numbers of poses:
     ``taken`` in all, ``refused`` by reason, ``used`` by the filter, ``outliers`` outside its gate,
-    ``outside`` of the sight of their camera, ``tilted`` far from upright.
+    ``outside`` of the sight of their camera, ``tilted`` far from upright. ``path``: all of them
+    compared with each other; ``on_body``: in a frame of the own body, not in that of odom.
     """
 
     topic: str
@@ -157,6 +159,8 @@ class SourceSeen:
     outliers: int = 0
     outside: int = 0
     tilted: int = 0
+    path: PosePath = field(default_factory=PosePath)
+    on_body: bool = True
 
 
 @dataclass

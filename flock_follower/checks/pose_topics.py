@@ -24,16 +24,19 @@ import numpy as np
 
 from flock_follower.checks.findings import ERROR, Finding, first, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations, SourceSeen, TopicSeen
+from flock_follower.checks.pose_path import judge_path, MIN_OUTLIER, WholeOdometry
 from flock_follower.checks.streams import BUSY, check_latency, check_rate
-from flock_follower.geometry import quaternion_to_matrix, Transform
+from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.neighbors_file import NeighborConfig
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import LATE_POSE, MANY_OUTLIERS, Sourced
 from flock_follower.perception.tracker import Tracker
 from flock_follower.pose_messages import POSE_TYPES, PoseState
+from flock_follower.ranges import PREDICT_TIMEOUT
 from flock_follower.topic_names import full_name
 
 MOST_REFUSED: Final = 0.5  # share of refused poses from which on there is an error
@@ -42,9 +45,14 @@ MIN_RATE: Final = 7.0  # Hz, of a neighbor in sight; slower poses were not flown
 MOST_JUDGED: Final = 600  # poses of a neighbor: each takes about a millisecond
 MIN_COS_SIGHT: Final = 0.26  # cosine of the angle, 75 degrees, from the optical axis
 MIN_COS_TILT: Final = 0.7  # cosine of the angle, 45 degrees, of a body from the vertical
-PREDICT_TIMEOUT: Final = 0.5  # s: predict_timeout of the planner by default
 MOST_GAPS: Final = 0.02  # share of poses after which the next one comes too late
 MIN_USED: Final = 10  # poses: of fewer, outliers and axes are not judged
+SMALL_OUTLIER: Final = 0.3  # m: if the noise hides those, outliers are unknown
+MAX_STAMP_OFFSET: Final = 0.02  # s, of the stamps from the exposures
+#: Deviations by which an offset of the stamps must differ from zero to be named.
+OFFSET_SIGMAS: Final = 3.0
+#: s: the stamps are right if their offset and two deviations are below.
+MAX_SURE_OFFSET: Final = 0.03
 
 
 class Arrival(NamedTuple):
@@ -68,7 +76,9 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
     perceiver.sources.static = static
     seen = {n.name: SourceSeen(n.source.topic) for n in config.neighbors if n.source is not None}
     frames = dict.fromkeys(seen, '')
-    waiting = iter(sorted(states, key=lambda state: state.stamp))
+    places: dict[str, list[_Place]] = {name: [] for name in seen}
+    states = sorted(states, key=lambda state: state.stamp)
+    waiting = iter(states)
     state = next(waiting, None)
     ordered = sorted(((arrival, name) for name, those in arrivals.items() for arrival in those),
                      key=lambda each: each[0].time)
@@ -83,9 +93,13 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
         frames[name] = pose.frame
         if (refused := perceiver.take_pose(name, pose, time)) is not None:
             its.refused[refused[0]] += 1
-        elif pose.frame.lstrip('/') in perceiver.sources.frames:
+        else:
+            frame = pose.frame.lstrip('/')
             its.outside += bool(
-                pose.position[2] < MIN_COS_SIGHT * np.linalg.norm(pose.position))
+                frame in perceiver.sources.frames
+                and pose.position[2] < MIN_COS_SIGHT * np.linalg.norm(pose.position))
+            places[name].append(_Place(
+                pose.stamp, pose.position, perceiver.sources.mounting(frame)))
         for outcome in perceiver.sources.due(time):
             if isinstance(outcome, Sourced):
                 _count(seen[outcome.name], outcome)
@@ -94,7 +108,35 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
                 seen[detail.partition(':')[0]].refused[reason] += 1
     for name, its in seen.items():
         its.frame = frames[name]
+        if places[name]:
+            _judge_path(its, places[name], states)
     return seen
+
+
+class _Place(NamedTuple):
+    """The position of a pose, its stamp, ns, and its frame on the own body; None: odom."""
+
+    stamp: int
+    position: Array
+    T_body_frame: Transform | None
+
+
+def _judge_path(its: SourceSeen, places: list[_Place], states: list[OdometryState]) -> None:
+    """Compare the poses of a neighbor with each other, those in the frame of the newest."""
+    its.on_body = places[-1].T_body_frame is not None
+    by_stamp = {place.stamp: place.position if place.T_body_frame is None
+                else place.T_body_frame.apply(place.position) for place in places
+                if (place.T_body_frame is not None) == its.on_body}
+    stamps, epoch = sorted(by_stamp), min(by_stamp)
+    near = [state for state in states
+            if stamps[0] - NANOSECONDS <= state.stamp <= stamps[-1] + NANOSECONDS]
+    its.path = judge_path(
+        np.array([(stamp - epoch) / NANOSECONDS for stamp in stamps]),
+        np.array([by_stamp[stamp] for stamp in stamps]),
+        WholeOdometry([OdometrySample(
+            (state.stamp - epoch) / NANOSECONDS, state.position, state.quaternion,
+            state.velocity, state.angular_velocity, derived=state.derived) for state in near]),
+        its.on_body)
 
 
 def _count(its: SourceSeen, outcome: Sourced) -> None:
@@ -127,6 +169,7 @@ def check_poses(seen: Observations) -> Iterator[Finding]:
             yield _check_gaps(seen, what, topic)
             yield _check_use(what, its)
             yield _check_outliers(what, its)
+            yield _check_stamps(what, its)
             yield _check_axes(what, its)
 
 
@@ -184,13 +227,39 @@ def _check_use(what: str, its: SourceSeen) -> Finding:
 
 
 def _check_outliers(what: str, its: SourceSeen) -> Finding:
-    share = its.outliers / max(its.used, 1)
+    """Check that few poses are outside the gate of the filter, or off the path of the others."""
+    share, path = its.outliers / max(its.used, 1), its.path
+    off = path.outliers / max(path.judged, 1)
     return first(
         f'{what} outliers', f'at most {MANY_OUTLIERS:.0%}',
         (its.used < MIN_USED, UNMEASURED, f'{its.used} poses are too few', ''),
         (share > MANY_OUTLIERS, WARNING, f'{share:.1%} are outside the gate of the filter',
          'raise the threshold of the detector; is the covariance of its poses honest?'),
-        (True, OK, f'{share:.1%}', ''))
+        (off > MANY_OUTLIERS, WARNING,
+         f'{off:.1%} are farther than the noise, and {MIN_OUTLIER:g} m, from the path of the '
+         'others', 'raise the threshold of the detector; the filter follows such poses'),
+        (path.judged < MIN_USED, UNMEASURED, 'too few poses in a row with odometry', ''),
+        (path.visible > SMALL_OUTLIER, UNMEASURED,
+         f'{off:.1%}; the noise hides those below {path.visible:.1f} m', ''),
+        (True, OK, f'{max(share, off):.1%}', ''))
+
+
+def _check_stamps(what: str, its: SourceSeen) -> Finding:
+    """Check that the stamps are those of the exposures, on the clock of the odometry."""
+    offset, deviation = its.path.offset, its.path.deviation
+    measured = f'{1e3 * abs(offset):.0f} ± {1e3 * deviation:.0f} ms'
+    return first(
+        f'{what} stamps', f'within {1e3 * MAX_STAMP_OFFSET:.0f} ms of the exposure, on the clock '
+        'of the odometry',
+        (its.path.judged < MIN_USED, UNMEASURED, 'too few poses in a row with odometry', ''),
+        (not its.on_body, UNMEASURED, 'unknown from poses in the frame of the odometry', ''),
+        (abs(offset) > max(MAX_STAMP_OFFSET, OFFSET_SIGMAS * deviation), WARNING,
+         f'{measured} {"before" if offset > 0.0 else "after"} the exposure',
+         'have the detector copy the stamp of its image, and the camera stamp the middle of the '
+         'exposure, by the clock of the odometry: a turn moves the neighbor'),
+        (abs(offset) + 2.0 * deviation <= MAX_SURE_OFFSET, OK, f'off by {measured}', ''),
+        (True, UNMEASURED, f'known to ± {1e3 * deviation:.0f} ms: turned too little for the '
+         'noise; yaw and roll it by hand', ''))
 
 
 def _check_axes(what: str, its: SourceSeen) -> Finding:

@@ -151,7 +151,7 @@ class PoseSources:
         if not max(newest - OLDEST_POSE, self._newest[name]) < stamp <= newest + AHEAD_OF_ODOMETRY:
             return UNTIMELY, f'{name}: {stamp - newest:.2f} s after the odometry'
         frame = state.frame.lstrip('/')
-        odom, T_body_frame = odom_frame.lstrip('/'), self._mounting(frame)
+        odom, T_body_frame = odom_frame.lstrip('/'), self.mounting(frame)
         # Without odometry the camera's frame is that of the odometry, on purpose.
         if not self._tracker.alone and frame in self.frames and frame in (BASE, odom):
             return UNKNOWN_FRAME, (f'{name}: frame {frame!r} is also that of a camera, whose axes '
@@ -222,7 +222,8 @@ class PoseSources:
                 pose = Transform((own.rotation @ mounting.rotation).T, pose.translation)
         return self._tracker.process_pose(each.stamp, each.name, pose, covariance, mounting)
 
-    def _mounting(self, frame: str) -> Transform | None:
+    def mounting(self, frame: str) -> Transform | None:
+        """Return the pose of a frame on the own body; None if it is not known to be there."""
         if frame == BASE:
             return Transform()
         known = self.frames.get(frame)

@@ -137,27 +137,15 @@ class TimeOffset:
         places = odometry.places(times + (self._first + OFFSET_GRID)[:, None], points)
         if places is None:
             return
-        precision = _precision(times - times[0])
+        precision = path_precision(times - times[0], POINT_STD**2, JERK_DENSITY)
         misfits = np.einsum('kni,kni->k', precision @ places, places)
         if not misfits.min() > 0.0:  # NaN is not
             return
         keep = 1.0 - 1.0 / REMEMBERED
         self._misfits = keep * self._misfits + misfits
         self._freedom = keep * self._freedom + 3.0 * (len(times) - 3)
-        chi2 = self._misfits * (self._freedom / self._misfits.min()) + (
-            OFFSET_GRID / INITIAL_DEVIATION)**2
-        best = int(chi2.argmin())
-        weights = np.exp(0.5 * (chi2[best] - chi2))
-        spread = float(weights.dot((OFFSET_GRID - OFFSET_GRID[best])**2) / weights.sum())
-        if 0 < best < len(OFFSET_GRID) - 1:
-            before, least, after = chi2[best - 1:best + 2].tolist()
-            bend = before - 2.0 * least + after
-            shift = 0.5 * GRID_STEP * (before - after) / bend
-            spread = max(2.0 * GRID_STEP**2 / bend, spread - GRID_STEP**2)
-        else:
-            shift, spread = 0.0, INITIAL_DEVIATION**2
-        self.estimate = self._first + float(OFFSET_GRID[best]) + shift
-        self.deviation = WIDENING * math.sqrt(spread)
+        found, self.deviation = fit_offset(self._misfits, self._freedom)
+        self.estimate = self._first + found
 
     def _apply(self) -> float:
         """Apply the estimate if it is significant; return by how much the applied one changed."""
@@ -169,10 +157,35 @@ class TimeOffset:
         return self.applied - before
 
 
-def _precision(times: Array) -> Array:
-    """Return the inverse covariance (n, n), 1/m^2, of a path with an unknown start, at times."""
+def fit_offset(misfits: Array, freedom: float) -> tuple[float, float]:
+    """
+    Return the likeliest offset about the initial one, s, and its widened standard deviation.
+
+    :param misfits: of each offset of OFFSET_GRID, in any unit: the least is that of the noise.
+    :param freedom: number of values that were measured less that of those fitted.
+    """
+    chi2 = misfits * (freedom / misfits.min()) + (OFFSET_GRID / INITIAL_DEVIATION)**2
+    best = int(chi2.argmin())
+    weights = np.exp(0.5 * (chi2[best] - chi2))
+    spread = float(weights.dot((OFFSET_GRID - OFFSET_GRID[best])**2) / weights.sum())
+    if 0 < best < len(OFFSET_GRID) - 1:
+        before, least, after = chi2[best - 1:best + 2].tolist()
+        bend = before - 2.0 * least + after
+        shift = 0.5 * GRID_STEP * (before - after) / bend
+        spread = max(2.0 * GRID_STEP**2 / bend, spread - GRID_STEP**2)
+    else:
+        shift, spread = 0.0, INITIAL_DEVIATION**2
+    return float(OFFSET_GRID[best]) + shift, WIDENING * math.sqrt(spread)
+
+
+def path_precision(times: Array, variance: float, jerk_density: float) -> Array:
+    """
+    Return the inverse covariance (n, n), 1/m^2, of a path with an unknown start, at times, s.
+
+    :param variance: of a point, m^2. :param jerk_density: see JERK_DENSITY.
+    """
     first, apart = np.minimum(times[:, None], times), np.abs(times[:, None] - times)
-    covariance = POINT_STD**2 * np.eye(len(times)) + JERK_DENSITY * first**3 * (
+    covariance = variance * np.eye(len(times)) + jerk_density * first**3 * (
         first**2 / 20.0 + first * apart / 8.0 + apart**2 / 12.0)
     inverse = np.linalg.inv(covariance)
     start = np.vander(times, 3)

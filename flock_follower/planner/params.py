@@ -24,7 +24,15 @@ from typing import NamedTuple
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.messages import DUPLICATE, FASTEST, POSITION_STD_MAX
-from flock_follower.ranges import A_MAX, Checked, ODOM_TIMEOUT, parameter, Range, V_MAX
+from flock_follower.ranges import (
+    A_MAX,
+    Checked,
+    ODOM_TIMEOUT,
+    parameter,
+    PREDICT_TIMEOUT,
+    Range,
+    V_MAX,
+)
 
 ROLES = LEADER, FOLLOWER, AVOID = 'leader', 'follower', 'avoid'
 RADIUS = Range(0.0, 5.0, 'm')
@@ -166,7 +174,7 @@ class PlannerParams(Checked):
         0.1, Range(0.02, 1.0, 's'),
         'time between commands')
     predict_timeout: float = parameter(
-        0.5, Range(0.2, 2.0, 's'),
+        PREDICT_TIMEOUT, Range(0.2, 2.0, 's'),
         'age up to which a neighbor is extrapolated and followed', live=True)
     heard_timeout: float = parameter(
         1.0, Range(0.05, 5.0, 's'),

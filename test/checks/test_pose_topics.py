@@ -26,18 +26,18 @@ from flock_follower.bags.message_types import empty
 from flock_follower.checks.collector import Collector, POSES
 from flock_follower.checks.findings import ERROR, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
-from flock_follower.checks.pose_topics import check_poses, PREDICT_TIMEOUT
+from flock_follower.checks.pose_topics import check_poses
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
 from flock_follower.messages import odometry, to_nanoseconds
 from flock_follower.neighbors_file import parse
 from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME, UNPLACED
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.planner.params import PlannerParams
 from flock_follower.pose_messages import POSE, pose_with_covariance
 from flock_follower.topic_names import names_there
 
 START = 1_700_000_000.0  # s
-IN_CAMERA = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0]).inverse() @ Transform(
+MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+IN_CAMERA = MOUNTING.inverse() @ Transform(
     translation=np.array([2.0, 0.2, 0.1]))
 COVARIANCE = np.diag([0.03**2] * 3 + [0.1**2] * 3)
 #: The body's axes as REP-103 has them, in a message that names the optical frame.
@@ -49,11 +49,13 @@ Change = Callable[[Any, int], Any]
 
 def levels(change: Change = lambda message, k: message, latency: float = 0.03,
            pose: Transform = IN_CAMERA, frames_topic: str = '', max_wait: float = 0.35,
-           gap: range = range(0)) -> tuple[Observations, dict[str, str]]:
+           gap: range = range(0), yaw: float = 0.0, offset: float = 0.0, noise: float = 0.03,
+           frame: str = 'optical') -> tuple[Observations, dict[str, str]]:
     """
     Return the observations of a hovering pair, and the level of each row.
 
     :param gap: numbers of the messages of odometry that are missing.
+    :param yaw: amplitude of the own yaw, rad. :param offset: of the exposures after the stamps, s.
     """
     random = np.random.default_rng(2)
     seen = Observations(live=False, names=names_there('', {}), topics={
@@ -69,12 +71,17 @@ def levels(change: Change = lambda message, k: message, latency: float = 0.03,
         if k not in gap:
             collector.take('odom', '/odom', odometry(
                 empty, to_nanoseconds(stamp), 'odom', 'base_link', [0.0, 0.0, 1.0],
-                [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0]), stamp)
+                own_attitude(yaw, k / 50.0), [0.0, 0.0, 0.0]), stamp)
         if k % 5 == 0:
-            error: Array = random.normal(0.0, 0.03, 3)
+            error: Array = random.normal(0.0, noise, 3)
+            turn = Transform(quaternion_to_matrix(own_attitude(yaw, k / 50.0 + offset)))
+            seen_there = MOUNTING.inverse() @ turn.inverse() @ MOUNTING @ pose
+            if frame == 'odom':
+                seen_there = Transform(translation=np.array([2.0, 0.2, 1.1]))
             message = change(pose_with_covariance(
-                empty, to_nanoseconds(stamp), 'optical',
-                Transform(pose.rotation, pose.translation + error), COVARIANCE), k // 5)
+                empty, to_nanoseconds(stamp), frame,
+                Transform(seen_there.rotation, seen_there.translation + error), COVARIANCE),
+                k // 5)
             if message is not None:
                 collector.take(POSES, '/poses', message, stamp + latency)
     collector.finish(parse({'neighbors': [{'name': 'leader', 'pose_topic': 'poses'}],
@@ -83,10 +90,19 @@ def levels(change: Change = lambda message, k: message, latency: float = 0.03,
                   for finding in check_poses(seen)}
 
 
-def outlier(message: Any, k: int) -> Any:
+def own_attitude(yaw: float, t: float) -> list[float]:
+    """Return the own attitude: it yaws back and forth, and does not tilt."""
+    return quaternion_from_rpy(0.0, 0.0, yaw * np.sin(2.0 * t)).tolist()
+
+
+def outlier(message: Any, k: int, size: float = 1.0) -> Any:
     if k % 20 == 7:
-        message.pose.pose.position.z += 1.0
+        message.pose.pose.position.z += size
     return message
+
+
+def small_outlier(message: Any, k: int) -> Any:
+    return outlier(message, k, 0.3)
 
 
 def with_bursts_missing(message: Any, k: int) -> Any:
@@ -109,7 +125,7 @@ def without_attitude(message: Any, k: int) -> Any:
 def test_poses_that_are_well_have_no_fault() -> None:
     seen, rows = levels()
     assert rows == {'': OK, 'rate': OK, 'latency': OK, 'gaps': OK, 'used': OK,
-                    'outliers': OK, 'axes': OK}
+                    'outliers': OK, 'stamps': UNMEASURED, 'axes': OK}
     assert seen.sources['leader'].taken == 60
 
 
@@ -118,19 +134,22 @@ def test_poses_that_are_well_have_no_fault() -> None:
     ({'latency': 0.5}, {'latency': ERROR, 'gaps': WARNING}),
     ({'change': with_bursts_missing}, {'gaps': WARNING}),
     ({'change': outlier}, {'outliers': WARNING}),
+    ({'change': small_outlier}, {'outliers': WARNING}),
+    ({'noise': 0.1}, {'outliers': UNMEASURED, 'stamps': UNMEASURED}),
+    ({'offset': 0.05}, {'stamps': WARNING}),
+    ({'offset': -0.05}, {'stamps': WARNING}),
+    ({'offset': 0.05, 'yaw': 0.0}, {'stamps': UNMEASURED}),
+    ({'frame': 'odom'}, {'stamps': UNMEASURED}),
     ({'change': outlier, 'latency': 0.15}, {'outliers': WARNING, 'latency': WARNING}),
-    ({'change': in_frame}, {'used': ERROR, 'outliers': UNMEASURED, 'axes': UNMEASURED}),
+    ({'change': in_frame}, {
+        'used': ERROR, 'outliers': UNMEASURED, 'stamps': UNMEASURED, 'axes': UNMEASURED}),
     ({'change': without_attitude}, {'used': WARNING}),
     ({'pose': FLU}, {'axes': ERROR}),
     ({'pose': TURNED}, {'axes': WARNING}),
     ({'frames_topic': 'none'}, {'frames_topic': ERROR})])
 def test_each_fault_of_poses_has_its_row(options: dict[str, Any], faults: dict[str, str]) -> None:
-    _, rows = levels(**options)
+    _, rows = levels(**{'yaw': 0.3, **options})
     assert {what: level for what, level in rows.items() if level != OK} == faults
-
-
-def test_gaps_are_those_of_the_planner() -> None:
-    assert PlannerParams.predict_timeout == PREDICT_TIMEOUT
 
 
 def test_refused_poses_are_counted_by_their_reasons() -> None:

@@ -43,12 +43,18 @@ NOISE = np.array([0.03] * 3 + [0.05] * 3)
 
 
 class Faults(NamedTuple):
-    """Faults of a detector: period in truth messages, share missing, of outliers, latency, s."""
+    """
+    Faults of a detector: period in truth messages, share missing, of outliers, latency, s.
+
+    ``size``: of the outliers, m. ``early``: of the stamps before the exposures, s.
+    """
 
     every: int = 1  # of 30 per second
     missing: float = 0.0
     outliers: float = 0.0
     latency: float = 0.02
+    size: float = 1.0
+    early: float = 0.0
 
 
 def recorded(folder: Path, faults: Faults) -> Path:
@@ -78,12 +84,13 @@ def recorded(folder: Path, faults: Faults) -> Path:
             error = NOISE * random.normal(size=6)
             if random.random() < faults.outliers:
                 away: Array = random.normal(size=3)
-                error[:3] += away / np.linalg.norm(away)
+                error[:3] += faults.size * away / np.linalg.norm(away)
             pose = (place(own) @ MOUNTING).inverse() @ place(leader)
             pose = Transform(rotation_vector_to_matrix(error[3:]) @ pose.rotation,
                              pose.translation + error[:3])
             sent = pose_with_covariance(
-                empty, leader.stamp, 'camera_optical_frame', pose, np.diag(NOISE**2))
+                empty, leader.stamp - round(1e9 * faults.early), 'camera_optical_frame', pose,
+                np.diag(NOISE**2))
             messages.append(message._replace(
                 topic='/poses', msgtype=POSE, data=serialize(sent, POSE),
                 stamp_ns=leader.stamp + round(1e9 * faults.latency)))
@@ -165,3 +172,17 @@ def test_check_names_latency_and_outliers_of_the_poses(tmp_path: Path) -> None:
     rows = {finding.what.removeprefix('poses of leader '): finding.level for finding in findings}
     assert (rows['latency'], rows['outliers'], rows['used'], rows['axes'], rows['frames_topic']
             ) == (WARNING, WARNING, OK, OK, OK)
+
+
+@pytest.mark.parametrize(('faults', 'row', 'measured'), [
+    (Faults(outliers=0.05, size=0.3), 'outliers', 'from the path of the others'),
+    (Faults(latency=0.02, early=0.05), 'stamps', 'before the exposure'),
+    (Faults(latency=0.06, early=-0.05), 'stamps', 'after the exposure')])
+def test_check_names_small_faults_of_the_poses(
+        tmp_path: Path, faults: Faults, row: str, measured: str) -> None:
+    _, findings = check_bag(recorded(tmp_path, faults), values(tmp_path))
+    rows = {finding.what.removeprefix('poses of leader '): finding for finding in findings
+            if finding.what.startswith('poses of leader')}
+    rows.pop('used')  # the first exposures are stamped before the odometry begins
+    assert [what for what, finding in rows.items() if finding.level == WARNING] == [row]
+    assert measured in rows[row].measured
