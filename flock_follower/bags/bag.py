@@ -137,9 +137,7 @@ class Bag(AbstractContextManager['Bag']):
         if isinstance(self._reader, SequentialReader):
             return max(self._reader.disorder, overlap(self._reader.spans.values()))
         files = _storages(self._reader)
-        back = overlap(Span(
-            file.metadata.start_time, file.metadata.end_time,
-            {connection.topic for connection in file.connections}) for file in files)
+        back = overlap(map(_span, files))
         for file in files or [getattr(self._reader, 'storage', None)]:
             newest = 0
             for chunk in sorted(getattr(file, 'chunks', []), key=lambda c: c.chunk_start_offset):
@@ -201,8 +199,8 @@ class Bag(AbstractContextManager['Bag']):
         folders = [copy(self._reader.storage) for _ in files]  # type: ignore[union-attr]
         for folder, file in zip(folders, files):
             folder.storages = [file]
-        return in_order((file.metadata.start_time, folder.messages(connections, start, stop))
-                        for folder, file in zip(folders, files))
+        return in_order([(_span(file), folder.messages(connections, start, stop))
+                         for folder, file in zip(folders, files)])
 
     def close(self) -> None:
         """Close the files."""
@@ -278,6 +276,11 @@ def _ros2_reader(path: Path, files: BagFiles) -> Rosbag2Reader | SequentialReade
 def _storages(reader: Reader) -> list[Any]:
     """Return rosbags' readers of the files of a folder; none for other readers."""
     return getattr(getattr(reader, 'storage', None), 'storages', [])
+
+
+def _span(storage: Any) -> Span:
+    return Span(storage.metadata.start_time, storage.metadata.end_time,
+                {connection.topic for connection in storage.connections})
 
 
 def _is_indexed(storage: Any) -> bool:

@@ -31,6 +31,7 @@ import yaml
 from flock_follower.bags.mcap_file import incomplete, mcap_files, MCAP_MAGIC, METADATA
 
 MCAP, SQLITE = '.mcap', '.db3'
+_SQLITE_MAGIC = b'SQLite format 3\0'
 
 
 class BagFiles(NamedTuple):
@@ -60,8 +61,9 @@ def find_files(path: Path) -> BagFiles:
     """
     Return the files of a bag, which may be one bare file.
 
-    :raises ValueError: there is none, or an SQLite file was never closed: its readers ignore rows
-        in a write-ahead log, as if nothing were missing.
+    :raises ValueError: there is none, or an SQLite file was never closed, or was cut short: its
+        readers ignore rows in a write-ahead log, and read zeros for missing bytes, as if nothing
+        were missing.
     :raises OSError: the folder or ``metadata.yaml`` cannot be read.
     """
     files = BagFiles([path], '') if path.is_file() else _in_folder(path)
@@ -70,6 +72,10 @@ def find_files(path: Path) -> BagFiles:
         if log.exists() and log.stat().st_size:
             raise ValueError(f'recording was not closed: {log.name} holds part of it; to close '
                              f"it: sqlite3 {file} 'PRAGMA wal_checkpoint(TRUNCATE)'")
+        size, whole = file.stat().st_size, _sqlite_size(file)
+        if size < whole:
+            raise ValueError(f'{file.name} was cut short: {size} of {whole} bytes; to save what '
+                             f'is whole: {files.remedy}')
     return files._replace(fault=incomplete(path) or _cut_short(files.paths) or files.fault)
 
 
@@ -83,6 +89,18 @@ def has_end(file: Path) -> bool:
         size = opened.seek(0, os.SEEK_END)
         opened.seek(max(size - len(MCAP_MAGIC), 0))
         return size > len(MCAP_MAGIC) and opened.read() == MCAP_MAGIC
+
+
+def _sqlite_size(file: Path) -> int:
+    """Return the size of an SQLite file, bytes, by its header; 0 if that has none."""
+    with file.open('rb') as opened:
+        header = opened.read(100)
+    if len(header) < 100 or not header.startswith(_SQLITE_MAGIC):
+        return 0
+    page, changed, pages, valid_for = (int.from_bytes(header[at:end], 'big') for at, end in (
+        (16, 18), (24, 28), (28, 32), (92, 96)))
+    # https://sqlite.org/fileformat.html: a page of 65536 bytes is a 1; older writers set no size.
+    return pages * (65536 if page == 1 else page) if changed == valid_for else 0
 
 
 def _in_folder(folder: Path) -> BagFiles:

@@ -29,6 +29,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import closing
 import heapq
+from itertools import chain
 from pathlib import Path
 import sqlite3
 from typing import NamedTuple
@@ -75,8 +76,9 @@ class SequentialReader:
     """
     Files of a recording, read one after the other, with rosbags' interface of a reader.
 
-    Messages come in the order of their stamps. ``start_time`` is the stamp of the first message,
-    ``end_time`` a nanosecond more than that of the last, ns.
+    Messages come in the order of their stamps within each file, and see ``in_order``.
+    ``start_time`` is the stamp of the first message, ``end_time`` a nanosecond more than that of
+    the last, ns.
     """
 
     def __init__(self, files: Sequence[Path]) -> None:
@@ -129,8 +131,8 @@ class SequentialReader:
         """Yield the messages of some connections from ``start`` to before ``stop``, ns."""
         wanted = {one.id for one in connections}
         first, end = start or 0, self.end_time if stop is None else stop
-        return in_order((span.start, self._messages_of(file, wanted, first, end))
-                        for file, span in self.spans.items())
+        return in_order([(span, self._messages_of(file, wanted, first, end))
+                         for file, span in self.spans.items()])
 
     def _messages_of(self, file: Path, wanted: Collection[int], start: int, stop: int
                      ) -> Iterator[_Message]:
@@ -161,15 +163,27 @@ def overlap(files: Iterable[Span]) -> int:
     return longest
 
 
-def in_order(files: Iterable[tuple[int, Iterator[_Message]]]) -> Iterator[_Message]:
+def in_order(files: Sequence[tuple[Span, Iterator[_Message]]]) -> Iterator[_Message]:
     """
-    Yield the messages of files by their stamps; those of one stamp in the order of the files.
+    Yield the messages of files, of which each has its messages in the order of their stamps.
 
-    :param files: of each file the stamp of its first message, ns, and its messages by their
-        stamps. Nothing is read of a file before that stamp is reached.
+    Files that overlap in time are merged by the stamps; others keep their order, in which a clock
+    that was set back between two of them shows.
     """
-    waiting = sorted(((start, number, messages)
-                      for number, (start, messages) in enumerate(files)), reverse=True)
+    groups: list[list[int]] = []
+    for number, (span, _) in enumerate(files):
+        near = [group for group in groups if any(
+            span.start < files[i][0].end and files[i][0].start < span.end for i in group)]
+        groups = [group for group in groups if group not in near]
+        groups.append(sorted((*chain(*near), number)))
+    for group in sorted(groups):
+        yield from _merge([files[i] for i in group])
+
+
+def _merge(files: Sequence[tuple[Span, Iterator[_Message]]]) -> Iterator[_Message]:
+    """Yield messages by their stamps; nothing is read of a file before its first one's."""
+    waiting = sorted(((span.start, number, messages)
+                      for number, (span, messages) in enumerate(files)), reverse=True)
     opened: list[tuple[int, int, _Message, Iterator[_Message]]] = []
 
     def read_on(number: int, messages: Iterator[_Message]) -> None:

@@ -269,7 +269,7 @@ class View(FlockNode):
         self._camera, self._transport = camera, transport
         self._source = OdometrySource(source)
         self._mounting = camera_mounting(camera.position, camera.rpy)
-        self._static.forget()
+        self._placed = ''  # the child frame of odom that was placed by tf_static
         self._child_configured = any(source.child_position) or any(source.child_rpy)
         self._calibration, self._model = b'', None
 
@@ -300,8 +300,11 @@ class View(FlockNode):
         return pose(sample) @ self._mounting if isinstance(sample, OdometrySample) else None
 
     def _take_odometry(self, message: Odometry) -> None:
-        if not self._child_configured:
-            self._static.place(self._source, message.child_frame_id)
+        child = message.child_frame_id
+        if not self._child_configured and child != self._placed and (
+                (known := self._static.transform(child)) is not None or self._placed):
+            self._placed = '' if known is None else child
+            self._source.place_child(known or Transform())
         state = self._source.take(message, self.get_clock().now().nanoseconds)
         self._source.new_events()  # relative_pose reports them
         if state is not None:

@@ -131,8 +131,9 @@ class Perceiver:
 
         :raises ValueError: if it is unusable; no image is processed until a usable one comes.
         """
-        roi = message.roi
-        calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
+        roi, rectified = message.roi, self.tracker.cameras[camera].rectified
+        # Of an image that is not rectified P does not count, and may be NaN, unlike itself.
+        calibration = (tuple(message.k), tuple(message.d), rectified and tuple(message.p),
                        message.distortion_model, message.width, message.height,
                        roi.x_offset, roi.y_offset, roi.width, roi.height,
                        message.binning_x, message.binning_y)
@@ -146,8 +147,7 @@ class Perceiver:
             return False
         known.model, known.calibration = None, ()
         try:
-            known.model = CameraModel.from_info(
-                message, self.tracker.cameras[camera].rectified)
+            known.model = CameraModel.from_info(message, rectified)
         except ValueError as error:
             known.fault = str(error)
             raise

@@ -67,6 +67,7 @@ NO_COVARIANCE = 'pose without a covariance'
 INVALID_COVARIANCE = 'pose with an invalid covariance'
 TWO_PUBLISHERS = 'poses of one neighbor from several publishers'
 UNPLACED = 'pose without odometry'
+CROWDED = 'pose while too many wait for odometry'
 
 
 class Sourced(NamedTuple):
@@ -171,10 +172,11 @@ class PoseSources:
         if isinstance(covariance, str):
             return covariance, name
         self._newest[name] = stamp
-        if len(self._poses) < MOST_WAITING:
-            insort(self._poses, _Waiting(
-                stamp, name, state, Transform.from_quaternion(state.position, attitude),
-                covariance, T_body_frame, now), key=lambda waiting: waiting.stamp)
+        if len(self._poses) >= MOST_WAITING:
+            return CROWDED, name
+        insort(self._poses, _Waiting(
+            stamp, name, state, Transform.from_quaternion(state.position, attitude),
+            covariance, T_body_frame, now), key=lambda waiting: waiting.stamp)
         return None
 
     def take_frame(self, stamp_ns: int, stamp: float, now: float) -> None:

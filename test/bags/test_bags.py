@@ -16,6 +16,7 @@
 
 import contextlib
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -299,6 +300,14 @@ def test_an_unclosed_sqlite3_recording_is_noticed(tmp_path):
     file.with_name(f'{file.name}-wal').write_bytes(b'rows not merged yet')
     for path in (file, tmp_path / 'bag.bag'):
         assert 'recording was not closed' in error_of(path)
+
+
+@pytest.mark.parametrize('lost', [1, 5, 4096, 10_000])
+def test_an_sqlite3_file_that_was_cut_short_is_refused(tmp_path, lost):
+    file = storage_file(write_sqlite3(tmp_path / 'bag', count=30))
+    file.write_bytes(file.read_bytes()[:-lost])  # SQLite reads zeros: a message of another time
+    for path in (file, tmp_path / 'bag'):
+        assert re.search(r'was cut short: .* of .* bytes.*sqlite3 .* \.recover', error_of(path))
 
 
 def good_bags(tmp_path):

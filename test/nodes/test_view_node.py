@@ -36,7 +36,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.command_messages import Command, trajectory
 from flock_follower.fast_dds import PROFILE_VARIABLES
-from flock_follower.geometry import IDENTITY_QUATERNION
+from flock_follower.geometry import IDENTITY_QUATERNION, Transform
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.view import IDLE_PERIOD, PERIOD, View
 
@@ -153,6 +153,14 @@ def test_bytes_that_are_no_message_are_invalid_page_goes_on(rig: Rig) -> None:
     rig.show()
     assert len(rig.pages.states) == shown + 1
     assert rig.counters == {'invalid planner/state': 1, 'invalid image': 1}
+
+
+def test_own_place_is_that_of_base_link_for_each_child_frame(rig: Rig) -> None:
+    rig.show()
+    rig.node._static.frames.add('base_link', 'imu', Transform(np.eye(3), np.array([0.5, 0, 0])))
+    for k, (child, x) in enumerate((('imu', 0.5), ('base_link', 1.0), ('imu', 0.5))):
+        rig.place('odom', child, (1.0, 2.0, 3.0), STAMP + k * 10_000_000)
+        assert rig.show()['own'] == [x, 2.0]
 
 
 def test_covariance_that_no_ellipsoid_has_leaves_the_page(rig: Rig) -> None:

@@ -50,11 +50,11 @@ class Queue:
         if calibrated:
             self.calibrate(CAMERA.matrix)
 
-    def calibrate(self, K: Any) -> None:
+    def calibrate(self, K: Any, P: float = 0.0) -> bool:
         info = empty('sensor_msgs/msg/CameraInfo')
         info.width, info.height, info.distortion_model = 640, 480, CAMERA.model
-        info.k, info.d = np.ravel(K), CAMERA.distortion
-        self.perceiver.take_camera_info(info)
+        info.k, info.d, info.p = np.ravel(K), CAMERA.distortion, np.full(12, P)
+        return self.perceiver.take_camera_info(info)
 
     def odometry(self, *stamps: float) -> bool:
         return [self.perceiver.take_odometry(OdometryState(
@@ -148,6 +148,12 @@ def test_an_unusable_image_is_dropped_with_the_reason(
     queue.image(0.0, encoding=encoding)
     (one,) = queue.processed(1.0)
     assert [name for name, _ in one.sighting.rejections] == [reason] and not one.usable
+
+
+def test_a_repeated_calibration_is_no_new_one() -> None:
+    queue = Queue(calibrated=False)
+    assert [queue.calibrate(CAMERA.matrix, np.nan) for _ in range(3)] == [True, False, False]
+    assert queue.calibrate(CAMERA.matrix * [[1.1], [1.1], [1.0]], np.nan)
 
 
 def test_time_that_jumps_back_forgets_the_images_that_wait() -> None:

@@ -162,6 +162,14 @@ def test_pose_in_odom_at_own_place_or_too_far_is_refused(place: Any, only: bool)
         pose_sources.INVALID]
 
 
+def test_pose_that_finds_no_room_to_wait_is_counted() -> None:
+    perceiver = started()
+    seconds(perceiver, 0.0, 1.0)
+    refused = [perceiver.take_pose('leader', pose(1.0 + 0.002 * k), 0.0)
+               for k in range(pose_sources.MOST_WAITING + 2)]
+    assert [each[0] for each in refused if each is not None] == 2 * [pose_sources.CROWDED]
+
+
 def test_repeated_stamp_and_pose_without_odometry_are_refused() -> None:
     perceiver = started()
     assert perceiver.take_pose('leader', pose(0.5), 0.0) == (pose_sources.UNPLACED, 'leader')

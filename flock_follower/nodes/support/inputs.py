@@ -78,7 +78,6 @@ class StaticChild:
 
     def __init__(self, node: Node) -> None:
         self.frames = StaticFrames()
-        self._placed = ''  # the child frame that was placed
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
@@ -113,25 +112,6 @@ class StaticChild:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""
         return None if child in ('', BASE) else self.frames.pose(child, BASE)
 
-    def place(self, source: OdometrySource, child: str) -> Transform | None:
-        """
-        Place the child frame of a source's messages; return its pose if that changed it.
-
-        A frame without a pose is taken as base_link, after another one, too.
-        """
-        if child == self._placed:
-            return None  # a static transform is passed once
-        pose = self.transform(child)
-        if pose is None and not self._placed:
-            return None
-        self._placed, pose = ('', Transform()) if pose is None else (child, pose)
-        source.place_child(pose)
-        return pose
-
-    def forget(self) -> None:
-        """Forget which frame was placed: the source is another one."""
-        self._placed = ''
-
 
 class OwnOdometry:
     """
@@ -147,7 +127,7 @@ class OwnOdometry:
                  use: Callable[[OdometryState, int], None], clock: NodeClock | None = None,
                  depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
-        self._node, self._use, self._clock = node, use, clock
+        self._node, self._use, self._clock, self._placed = node, use, clock, ''
         self._found = ''  # the frame of the velocity that was logged
         node.diagnostics.checks.append(self._problem)
         node.diagnostics.sources.append(self._values)
@@ -163,11 +143,13 @@ class OwnOdometry:
             clock_shift = self._clock.clock_shift
             if not self._clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
                 return
-        if self._static and (pose := self._static.place(self.source, child)) is not None:
-            known = self._static.transform(child) is not None
+        if self._static and child != self._placed and (
+                (pose := self._static.transform(child)) is not None or self._placed):
+            self._placed = '' if pose is None else child  # a static transform is passed once
+            self.source.place_child(pose or Transform())
             self._node.get_logger().info(
-                f'{child} is at {pose.translation.round(3).tolist()} m on {BASE} by tf_static'
-                if known else f'the child frame of odom, {child!r}, is taken as {BASE}')
+                f'the child frame of odom, {child!r}, is taken as {BASE}' if pose is None else
+                f'{child} is at {pose.translation.round(3).tolist()} m on {BASE} by tf_static')
         state = self.source.take(message, arrival - clock_shift, clock_shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
