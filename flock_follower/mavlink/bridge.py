@@ -291,6 +291,15 @@ class Bridge:
                 self.requests.begin(commands.land, now, end=Handover(
                     self.gate.permission.reason, cause=Cause.SILENT)))
 
+    def _forget_ended_flight(self, status: VehicleStatus) -> None:
+        """Report the requests that ended a flight during this flight only."""
+        newest = self.requests.newest
+        by_operator = newest is not None and newest is not self.blind_landing and not newest.own
+        if by_operator or not status.armed:
+            self.blind_landing = None
+        if not status.armed:
+            self.handover = None
+
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
         """Set height 0: the place of arming, or home if the arming was not observed."""
         heights, left = self.gate.heights, self.telemetry.has_left_ground(now)
@@ -309,6 +318,7 @@ class Bridge:
         handover = self.handover
         if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
+        self._forget_ended_flight(status)
         end = self.end.reason(
             self.gate.active_since, self.gate.commands.received,
             self.gate.handover(now) if flies else '', now)

@@ -95,6 +95,37 @@ def test_lost_odometry_behind_autopilot_estimate_ends_stream(personality, action
     assert action == 'land' or not flight.commands(mavlink.MAV_CMD_DO_SET_MODE, lost)
 
 
+@pytest.mark.parametrize('disarms', [False, True])
+def test_a_blind_landing_is_not_reported_in_the_next_flight(disarms):
+    """PX4 1.18: /diagnostics showed 'the bridge requests land' through the whole flight."""
+    flight = forwarding(Flight(**without_gps('px4', blind_action='land'))).follow(2.0)
+    flight.forwards = flight.odometry = False
+    flight.fly(1.0)
+    assert flight.bridge.blind_landing.outcome.success
+    flight.forwards = flight.odometry = True
+    flight.fly(1.5)
+    if disarms:  # whoever arms it next
+        flight.fly_until(lambda: not flight.bridge.telemetry.status.armed, 15.0)
+    else:
+        outcome = flight.ask('offboard', True)
+        assert outcome.success, outcome
+    flight.fly(0.1)
+    assert flight.bridge.blind_landing is None
+
+
+@BOTH
+def test_a_handover_is_not_reported_in_the_next_flight(personality):
+    """Neither if nobody calls a service: the pilot lands, and arms again."""
+    flight = Flight(personality).follow(2.0)
+    flight.planner = None
+    flight.fly(4.0)
+    assert flight.bridge.handover.outcome.success
+    flight.controller.pilot_switches(flight.modes.land)
+    flight.fly_until(lambda: not flight.bridge.telemetry.status.armed, 15.0)
+    flight.fly(0.1)
+    assert flight.bridge.handover is None
+
+
 @BOTH
 @pytest.mark.parametrize('ends', [False, True])
 def test_a_pilot_who_took_over_on_a_dead_line_is_left_alone(personality, ends):
