@@ -114,7 +114,7 @@ def decide(situation: Situation) -> Setpoint:
     if refusal is None and situation.command is not None:
         command = situation.command.command
         if command.relative:
-            return _relative(full, command, offset, place)
+            return _relative(situation.limits, command, offset, place)
         assert known.velocity is not None  # else it is refused
         axis = _direction(command.separation_axis)
         safe = _limit_and_offset(
@@ -204,7 +204,7 @@ def _marker_obstacle(situation: Situation) -> Obstacle | None:
     return None if situation.report.airborne else Obstacle.ON_GROUND
 
 
-def _relative(full: GateLimits, command: Command, offset: Array, place: Location) -> Setpoint:
+def _relative(limits: GateLimits, command: Command, offset: Array, place: Location) -> Setpoint:
     """
     Return the setpoint of a command that is based on the marker alone.
 
@@ -212,23 +212,23 @@ def _relative(full: GateLimits, command: Command, offset: Array, place: Location
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE)
     strongest = RELATIVE_ACCELERATION_MAX * SENT_INSIDE
-    margin = min(HEIGHT_MARGIN, 0.25 * (full.height_max - full.height_min))
-    height, climb, horizon = place.height, place.climb_rate, full.speed_horizon
+    margin = min(HEIGHT_MARGIN, 0.25 * (limits.height_max - limits.height_min))
+    height, climb, horizon = place.height, place.climb_rate, limits.speed_horizon
     assert height is not None  # else it is refused
     least, _ = envelope.vertical_range(
-        full, Location(height - margin, climb), climb, horizon, strongest)
+        limits, Location(height - margin, climb), climb, horizon, strongest)
     _, most = envelope.vertical_range(
-        full, Location(height + margin, climb), climb, horizon, strongest)
+        limits, Location(height + margin, climb), climb, horizon, strongest)
     within = min(max(float(wanted[2]), least), most)
     up = min(max(within, -strongest), strongest)
     level = limit_norm(wanted[:2], math.sqrt(max(strongest ** 2 - up ** 2, 0.0)))
     acceleration = np.array([*level, up])
-    total = _with_offset(acceleration, offset, full.a_max, None)
+    total = _with_offset(acceleration, offset, limits.a_max, None)
     shortened = up != within or level.tolist() != wanted[:2].tolist()
-    limits = ['a_max'] if shortened or not _is_sum(total, acceleration, offset) else []
+    reasons = ['a_max'] if shortened or not _is_sum(total, acceleration, offset) else []
     if within != wanted[2]:
-        limits.append(ENVELOPE)
-    return Setpoint(COMMAND, '', total, wrap_angle(command.yaw), ', '.join(limits))
+        reasons.append(ENVELOPE)
+    return Setpoint(COMMAND, '', total, wrap_angle(command.yaw), ', '.join(reasons))
 
 
 def _with_offset(acceleration: Array, offset: Array, a_max: float, axis: Array | None) -> Array:

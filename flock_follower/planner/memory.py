@@ -35,6 +35,7 @@ from flock_follower.planner.inputs import (
     Moving,
     Neighbor,
     OwnState,
+    propagate,
     Rejection,
     too_far,
     uncertain,
@@ -212,8 +213,9 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
-                memory = memory._replace(neighbors={}, flock={}, ranged={}, altitude=None,
-                                         lost=None, leader=None, looking=False)
+                memory = memory._replace(
+                    neighbors={}, flock={}, ranged={}, altitude=_after_jump(memory, own),
+                    lost=None, leader=None, looking=False)
             if me is not None and jump <= ODOMETRY_JUMP and own.stamp > me.stamp:
                 drag = _drag(memory, me, own, params)
             me = own
@@ -271,6 +273,14 @@ Known = TypeVar('Known')
 def by_name(known: dict[str, Known]) -> dict[str, Known]:
     """Return a mapping in the order of its names: sums and ties then do not depend on history."""
     return dict(sorted(known.items())) if len(known) > 1 else known
+
+
+def _after_jump(memory: Memory, own: OwnState) -> Altitude | None:
+    """Return the altitude in the frame of odometry that has jumped: its bounds jump, too."""
+    if memory.altitude is None or memory.own is None:
+        return None
+    z, before = float(own.position[2]), propagate(memory.own, own.stamp)
+    return memory.altitude.after_jump(z, z - float(before.position[2]))
 
 
 def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams) -> Array:

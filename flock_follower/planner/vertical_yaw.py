@@ -83,6 +83,12 @@ class Altitude(NamedTuple):
         low, high = _within_limits(ground, params)
         return cls(z, min(low, z), max(high, z), ground=ground, limits=limits)
 
+    def after_jump(self, z: float, jump: float) -> Altitude:
+        """Return it in a frame of odometry that is higher by ``jump``, m; it holds ``z``, m."""
+        return Altitude(z, min(self.lowest + jump, z), max(self.highest + jump, z),
+                        ground=None if self.ground is None else self.ground + jump,
+                        limits=self.limits)
+
     def with_limits_of(self, params: PlannerParams) -> Altitude:
         """Return it with the bounds of parameters that have changed in flight."""
         limits = params.altitude_min, params.altitude_max

@@ -14,6 +14,7 @@
 
 """Flight without odometry: what the gate admits then, for how long, and after what."""
 
+from dataclasses import replace
 import math
 import struct
 
@@ -90,11 +91,12 @@ COMPONENT = ANY | st.floats(-3.0, 3.0) | st.floats(-1e300, 1e300)
 @example((0.0, 0.0, -1.0), 0.0, 0.9, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 @example((0.0, 0.0, 1.0), 0.0, 9.6, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 @example((1.5, 0.0, 0.0), 0.0, 5.0, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
+@example((1.0, 0.0, 0.0), 0.0, 5.0, 0.0, 1.0, 0.1, (1.0, 0.0, 0.0), 1.5, True)
 def test_acceleration_is_small_and_leads_into_heights(
         wanted, yaw, height, climb, lasted, marker_age, offset, a_max, airborne):
-    limits = GateLimits(relative_flight=True, a_max=a_max)
-    setpoint = judge(limits, command=Command(wanted, yaw, relative=True),
-                     airborne=airborne, place=Location(height, climb), offset=offset,
+    limits = GateLimits(relative_flight=True, a_max=a_max)  # lowered in flight
+    setpoint = judge(limits, full=replace(limits, a_max=20.0),
+                     command=Command(wanted, yaw, relative=True), airborne=airborne, place=Location(height, climb), offset=offset,
                      relative=Relative(lasted), source_age=marker_age)
     if setpoint.kind != COMMAND:
         assert not setpoint.acceleration.any()
