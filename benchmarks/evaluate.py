@@ -79,7 +79,8 @@ def main(args: Sequence[str] | None = None) -> int:
         result = Path(folder) / 'result.mcap'
         runs: dict[str, Callable[[], Evaluation | None]] = {
             'reading and decoding': lambda: read_and_decode(options.bag),
-            'evaluate --check skip': lambda: evaluate(options.bag, values, result, checked=False),
+            'evaluate --check skip': lambda: evaluate(
+                options.bag, values, result, with_check=False),
             'evaluate': lambda: evaluate(options.bag, values, result)}
         times: dict[str, list[tuple[float, Evaluation | None]]] = {name: [] for name in runs}
         try:
