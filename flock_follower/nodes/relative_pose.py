@@ -101,7 +101,9 @@ class _Camera:
         self.debug_images = node.create_publisher(
             Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
             best_effort())
-        node.diagnostics.checks += [self._processing_problem, self._rectified_problem]
+        self._camera_info = node.resolve_topic_name(values.camera_info)
+        node.diagnostics.checks += [self._processing_problem, self._rectified_problem,
+                                    self._calibration_problem]
 
     def reject(self, reason: str, detail: str = '') -> None:
         """Count that an image, or something in it, was dropped."""
@@ -121,6 +123,11 @@ class _Camera:
             return None  # a rectified camera has no distortion
         return ERROR, (f'{self._images} is marked as rectified, its camera_info has distortion: '
                        'start relative_pose and planner with rectified:=true')
+
+    def _calibration_problem(self, now: float) -> Problem | None:
+        count = self._node.count_publishers(self._camera_info)
+        return (ERROR, f'{count} publishers on {self._camera_info}: images have the calibration '
+                'of any one, and wrong distances; end all but one') if count > 1 else None
 
 
 class RelativePose(FlockNode):

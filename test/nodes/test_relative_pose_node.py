@@ -353,6 +353,20 @@ def test_the_child_frame_of_odom_is_placed_by_tf_static(
     np.testing.assert_allclose(from_odometry(r.found[1]).position, LEADER.translation, atol=0.03)
 
 
+def test_two_calibrations_of_one_camera_are_named(rig: Callable[..., Rig]) -> None:
+    node, counts = rig().node, {'/camera_info': 2}
+    node.count_publishers = lambda topic: counts.get(topic, 0)
+
+    def named() -> list[tuple[int, str]]:
+        return [found for check in node.diagnostics.checks
+                if (found := check(0.0)) is not None and 'publishers on' in found[1]]
+
+    ((level, text),) = named()
+    assert level == relative_pose.ERROR and text.startswith('2 publishers on /camera_info: ')
+    counts['/camera_info'] = 1
+    assert not named()
+
+
 def test_motion_without_odometry_places_neighbor_in_own_frame(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
