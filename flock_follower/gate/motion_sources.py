@@ -39,8 +39,10 @@ from flock_follower.gate.velocity_check import (
     MotionReport,
     ODOM,
     Path,
+    PATH_GAP,
     plausible_velocity,
     refusal,
+    rotate_about_vertical,
     Source,
     Velocity,
     VelocityComparison,
@@ -106,12 +108,26 @@ class MotionSources:
             known.take_velocity(v, time)
             known.take_yaw(report.yaw, time)
             known.take_position(report.position, time, report.std, max_age, (
-                self._sources[AUTOPILOT].path if source == ODOM else None))
+                self._displacement_in_gap(report.yaw, time) if source == ODOM else None))
             now_at = self.position
             if by != self.source and before is not None and now_at is not None:
                 # Odometry takes over, in a frame of its own: the vehicle has not moved by that.
                 self._handed_on = before - now_at
         return refused
+
+    def _displacement_in_gap(self, yaw: float, time: float) -> Array | None:
+        """
+        Return the displacement (3,), m, in a gap of odom by the autopilot, in the frame of odom.
+
+        :param yaw: the newest by odom, rad; :param time: its time, s.
+        :returns: None without a gap, or if the displacement or the turn of the frames is unknown.
+        """
+        autopilot = self._sources[AUTOPILOT]
+        displaced = autopilot.path.displacement_in_gap(self._sources[ODOM].path, time)
+        other_yaw, known_at = autopilot.yaw(time)
+        if displaced is None or not (math.isfinite(yaw) and abs(time - known_at) <= PATH_GAP):
+            return None
+        return rotate_about_vertical(displaced, yaw - other_yaw)
 
     def take_position(self, source: str, position: ArrayLike, time: float,
                       max_age: float) -> None:

@@ -290,12 +290,12 @@ class Path:
         self._kept: deque[tuple[float, Array]] = deque()
 
     def take(self, position: Array, velocity: Array | None, now: float,
-             other: Path | None = None) -> None:
+             displaced: Array | None = None) -> None:
         """
         Take a position, m.
 
         :param velocity: (3,), m/s, by the same source; None: jumps are not detected.
-        :param other: of another source, which shows the motion in a gap of this one.
+        :param displaced: displacement (3,), m, in a gap of this source, by another one.
         """
         elapsed = now - self._time
         if elapsed <= 0.0:
@@ -304,12 +304,10 @@ class Path:
             self._kept.clear()
         shifted = position - self._shift
         if self.position is not None and velocity is not None:
-            surprise = shifted - self.position - velocity * elapsed
-            largest = self._largest_surprise(velocity, elapsed)
-            if elapsed > PATH_GAP and other is not None and other.covers(self._time, now):
-                surprise = shifted - self.position - other.displacement(
-                    self._time, min(now, other.span[1]))
-                largest = DISPLACEMENT_TOLERANCE
+            expected = velocity * elapsed if displaced is None else displaced
+            surprise = shifted - self.position - expected
+            largest = DISPLACEMENT_TOLERANCE if displaced is not None else (
+                self._largest_surprise(velocity, elapsed))
             if math.hypot(*surprise.tolist()) > largest:
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
@@ -333,10 +331,17 @@ class Path:
         """Return the times, s, between which the path is known."""
         return (self._kept[0][0], self._kept[-1][0]) if self._kept else (math.inf, -math.inf)
 
-    def covers(self, start: float, end: float) -> bool:
-        """Return whether the path is known between two times, s, except for a last PATH_GAP."""
+    def displacement_in_gap(self, of: Path, now: float) -> Array | None:
+        """
+        Return the displacement (3,), m, since the last position of another path.
+
+        :returns: None if that path has no gap at ``now``, s, or this one does not cover the gap,
+            except for a last PATH_GAP.
+        """
         first, last = self.span
-        return first <= start and end - last <= PATH_GAP
+        if now - of._time <= PATH_GAP or first > of._time or now - last > PATH_GAP:
+            return None
+        return self.displacement(of._time, min(now, last))
 
     def displacement(self, start: float, end: float) -> Array:
         """Return the displacement (3,), m, from one time within the span to another."""
@@ -368,12 +373,15 @@ def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     start, end = max(first, other_first, now - DISPLACEMENT_WINDOW), min(last, other_last)
     if end <= start or now - end > PATH_GAP:
         return np.zeros(3)
-    moved = one.displacement(start, end)
-    if turn != 0.0:
-        cos, sin = math.cos(turn), math.sin(turn)
-        moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
-    result: Array = moved - other.displacement(start, end)
-    return result
+    in_other = rotate_about_vertical(one.displacement(start, end), turn)
+    return in_other - other.displacement(start, end)
+
+
+def rotate_about_vertical(vector: Array, angle: float) -> Array:
+    """Return a vector (3,) rotated about the vertical by an angle, rad."""
+    x, y, z = vector.tolist()
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([cos * x - sin * y, sin * x + cos * y, z])
 
 
 class Source:
@@ -395,18 +403,18 @@ class Source:
             self.velocity, self.velocity_time = velocity, time
 
     def take_position(self, position: ArrayLike | None, time: float, std: float,
-                      max_age: float, other: Path | None = None) -> None:
+                      max_age: float, displaced: Array | None = None) -> None:
         """
         Take a position (3,), m, at a time, s, with a standard deviation, m.
 
         :param max_age: of the velocity that the position is compared with, s.
-        :param other: see ``Path.take``.
+        :param displaced: see ``Path.take``.
         """
         p = finite_vector(position)
         if p is not None and max(map(abs, p.tolist())) < SANE:
             fresh = time - self.velocity_time <= max_age
             self.position = p
-            self.path.take(p, self.velocity if fresh else None, time, other)
+            self.path.take(p, self.velocity if fresh else None, time, displaced)
             self.std = std if math.isfinite(std) else 0.0
 
     def take_yaw(self, yaw: float, time: float) -> None:

@@ -266,6 +266,20 @@ def test_autopilot_shows_the_motion_while_odometry_pauses(pause, restarts):
     assert gate.place(now).offset[0] == pytest.approx(7.0, abs=0.1)
 
 
+@pytest.mark.parametrize('turn', [-0.3, 0.0, 0.3])
+def test_motion_in_a_pause_counts_in_the_frame_of_odometry(turn):
+    """The frame of the autopilot may be turned against it by up to ``yaw_disagreement``."""
+    gate = fly(Gate(GateLimits(v_max=2.0)), 10.0)
+    ahead = np.array([math.cos(turn), math.sin(turn), 0.0])
+    for now in np.arange(10.0, 16.0, 0.05):
+        x = 2.0 * (now - 10.0)
+        gate.take_motion('autopilot', MotionReport(2.0 * ahead, turn, x * ahead), 0.0, now)
+        if not 12.0 < now < 14.5:
+            gate.take_motion('odom', MotionReport([2.0, 0.0, 0.0], 0.0, [x, 0.0, 0.0]), 0.0, now)
+        decide(gate, now)
+    assert gate.place(now).offset == pytest.approx([x, 0.0], abs=0.1)
+
+
 def test_motion_while_odometry_pauses_is_no_jump():
     gate = fly(Gate(LIMITS), 10.0)
     x, now = along(gate, 'odom', 0.0, 2.0, 10.0, 5.0)
