@@ -186,7 +186,7 @@ def test_topic_with_two_uses_is_refused(rig: Callable[..., Rig], text: str) -> N
 def test_a_topic_of_another_type_is_reported(
         rig: Callable[..., Rig], ends: dict[str, list[str]]) -> None:
     ends['/poses'] = ['std_msgs/msg/String']
-    assert 'holds std_msgs/msg/String' in rig().problems()
+    assert 'has type std_msgs/msg/String' in rig().problems()
 
 
 def test_topic_of_frames_without_a_header_is_reported(
