@@ -265,6 +265,7 @@ class HeightEstimator:
         self._newest = math.nan  # altitude by the sensor, m
         self._altitude = 0.0
         self._velocity_error = 0.0
+        self._source_error: float | None = None  # when the other source was lost last, m/s
         self._reported: float | None = None
         self._time = self._began = -math.inf
         self._sensor = ''
@@ -308,9 +309,14 @@ class HeightEstimator:
     def _follow(self, altitude: float, climb_rate: float | None, elapsed: float,
                 now: float) -> None:
         if (climb_rate is None) != (self._reported is None):
-            # The rate stays; only its components change.
-            unknown = climb_rate is not None and now - self._began < SETTLING
-            self._velocity_error = 0.0 if unknown else self.climb_rate - (climb_rate or 0.0)
+            if climb_rate is None:  # the rate stays; only its components change
+                self._source_error, self._velocity_error = self._velocity_error, self.climb_rate
+            elif self._source_error is not None:
+                # The sensor alone knows the rate late: not in a descent, nor after a touchdown.
+                self._velocity_error = self._source_error
+            else:
+                settled = now - self._began >= SETTLING
+                self._velocity_error = self.climb_rate - climb_rate if settled else 0.0
         expected = self._altitude + elapsed * ((climb_rate or 0.0) + self._velocity_error)
         difference = altitude - expected
         self._differences.append((now, difference))

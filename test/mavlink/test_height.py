@@ -78,6 +78,21 @@ def test_other_source_is_corrected_in_seconds_hardly_disturbed(lacks):
     assert heights.correct(2.0, 20.0 + HEIGHT_TIMEOUT) == 2.0
 
 
+@pytest.mark.parametrize('back', [11.5, 14.5])  # s: in the descent, after the touchdown
+@pytest.mark.parametrize('lacks', [0.0, 0.3])
+def test_odometry_that_returns_has_its_error_of_before(back, lacks):
+    """PX4 1.18: after a landing without odometry its estimate sank by 1 m on the ground."""
+    def sinks(t):
+        return -0.6 * (10.0 < t < 14.0)
+
+    def falls(t):
+        return -0.6 * min(max(t - 10.0, 0.0), 4.0)
+    heights, _ = flown(back + 0.1, falls, lambda t: (
+        None if 10.3 < t < back else sinks(t) - lacks))
+    assert heights.correct(sinks(back) - lacks, back + 0.1) == pytest.approx(
+        sinks(back), abs=0.1)
+
+
 @pytest.mark.parametrize('jump', [0.5, -0.5, 2.0, 30.0])
 def test_jump_without_matching_velocity_shifts_reference_counted(jump):
     heights, found = flown(20.0, lambda t: jump * (t > 10.0))
