@@ -122,12 +122,13 @@ class MotionSources:
         :param yaw: the newest by odom, rad; :param time: its time, s.
         :returns: None without a gap, or if the displacement or the turn of the frames is unknown.
         """
-        autopilot = self._sources[AUTOPILOT]
-        displaced = autopilot.path.displacement_in_gap(self._sources[ODOM].path, time)
-        other_yaw, known_at = autopilot.yaw(time)
-        if displaced is None or not (math.isfinite(yaw) and abs(time - known_at) <= PATH_GAP):
+        autopilot, begun = self._sources[AUTOPILOT], self._sources[ODOM].path.time
+        (first, last), (other_yaw, known_at) = autopilot.path.span, autopilot.yaw(time)
+        if not (time - begun > PATH_GAP >= time - min(last, known_at) and first <= begun and (
+                math.isfinite(yaw))):
             return None
-        return rotate_about_vertical(displaced, yaw - other_yaw)
+        return rotate_about_vertical(
+            autopilot.path.displacement(begun, min(time, last)), yaw - other_yaw)
 
     def take_position(self, source: str, position: ArrayLike, time: float,
                       max_age: float) -> None:

@@ -284,7 +284,8 @@ class Path:
     def __init__(self) -> None:
         self.position: Array | None = None
         """The newest, m, in the frame of the source without its jumps."""
-        self._time = -math.inf
+        self.time = -math.inf
+        """That of the newest, s."""
         self._velocity: Array | None = None
         self._shift: Array | float = 0.0
         self._kept: deque[tuple[float, Array]] = deque()
@@ -297,7 +298,7 @@ class Path:
         :param velocity: (3,), m/s, by the same source; None: jumps are not detected.
         :param displaced: displacement (3,), m, in a gap of this source, by another one.
         """
-        elapsed = now - self._time
+        elapsed = now - self.time
         if elapsed <= 0.0:
             return
         if elapsed > PATH_GAP:
@@ -311,7 +312,7 @@ class Path:
             if math.hypot(*surprise.tolist()) > largest:
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
-        self.position, self._time, self._velocity = shifted, now, velocity
+        self.position, self.time, self._velocity = shifted, now, velocity
         if not self._kept or now - self._kept[-1][0] >= SPACING:
             self._kept.append((now, shifted))
             while len(self._kept) > 2 and now - self._kept[1][0] >= DISPLACEMENT_WINDOW:
@@ -330,18 +331,6 @@ class Path:
     def span(self) -> tuple[float, float]:
         """Return the times, s, between which the path is known."""
         return (self._kept[0][0], self._kept[-1][0]) if self._kept else (math.inf, -math.inf)
-
-    def displacement_in_gap(self, of: Path, now: float) -> Array | None:
-        """
-        Return the displacement (3,), m, since the last position of another path.
-
-        :returns: None if that path has no gap at ``now``, s, or this one does not cover the gap,
-            except for a last PATH_GAP.
-        """
-        first, last = self.span
-        if now - of._time <= PATH_GAP or first > of._time or now - last > PATH_GAP:
-            return None
-        return self.displacement(of._time, min(now, last))
 
     def displacement(self, start: float, end: float) -> Array:
         """Return the displacement (3,), m, from one time within the span to another."""
