@@ -167,7 +167,7 @@ class Permission:
         return replace(self, phase=Phase.GIVING_BACK, reason=why, cause=self.cause if (
             unseen) else cause, taker=STICK if cause is Cause.STICK else self.taker)
 
-    def _stopped(self, why: str, cause: Cause) -> Permission:
+    def _stop_sending(self, why: str, cause: Cause) -> Permission:
         """Return the permission that sends nothing; a stick that was moved still counts."""
         return Permission(reason=why, received=self.received, cause=cause, taker=self.taker)
 
@@ -179,7 +179,7 @@ class Permission:
     def fall_silent(self, why: str) -> Permission:
         """Stop sending, as no velocity is valid: only silence starts the failsafe."""
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
-        return self._stopped(f'fell silent: {why}', Cause.SILENT) if self.streams else self
+        return self._stop_sending(f'fell silent: {why}', Cause.SILENT) if self.streams else self
 
     def follow_silence(self, silence: float) -> Permission:
         """Brake until offboard is requested, after a time, s, without a report of the mode."""
@@ -190,7 +190,7 @@ class Permission:
 
     def land(self) -> Permission:
         """End a flight after a landing."""
-        return self._stopped(ON_GROUND, Cause.LANDED) if self.streams else self
+        return self._stop_sending(ON_GROUND, Cause.LANDED) if self.streams else self
 
     def reset(self, why: str) -> Permission:
         """Reset: the autopilot, rebooted or replaced, has not received the request."""
@@ -225,7 +225,7 @@ class Permission:
                 return replace(now, obeyed=True)
             if status.armed and (now.taker == STICK or now.cause is Cause.MODE_UNKNOWN):
                 return now.leave_mode(status, now.taker)
-            return now._stopped(f'given back ({now.reason})', Cause.GIVEN_BACK)
+            return now._stop_sending(f'given back ({now.reason})', Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):
             return _end_on_ground(status)
         if not status.offboard:

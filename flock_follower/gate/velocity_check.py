@@ -255,7 +255,7 @@ class VelocityComparison:
 #: Displacements are compared over this time, s.
 DISPLACEMENT_WINDOW: Final[float] = 5.0
 #: Displacements may differ by this, m, or by 3 standard deviations if those are more.
-TOLERANCE: Final[float] = 0.5
+DISPLACEMENT_TOLERANCE: Final[float] = 0.5
 #: Odometry that reports a larger standard deviation of its position, m, counts with this one: the
 #: drift since the start grows without limit, and that of a few seconds does not.
 ODOMETRY_STD_MAX: Final[float] = 0.5
@@ -309,7 +309,7 @@ class Path:
             if elapsed > PATH_GAP and other is not None and other.covers(self._time, now):
                 surprise = shifted - self.position - other.displacement(
                     self._time, min(now, other.span[1]))
-                largest = TOLERANCE
+                largest = DISPLACEMENT_TOLERANCE
             if math.hypot(*surprise.tolist()) > largest:
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
@@ -457,6 +457,6 @@ def find_displacement(odom: Source, autopilot: Source | None, turn: float, heigh
 def _too_far(error: Array, std: float, other: str) -> Refusal | None:
     """Return the difference if it exceeds the limit for a standard deviation, both m, or None."""
     distance = math.sqrt(error.dot(error))
-    return None if not distance > max(TOLERANCE, 3.0 * std) else Refusal(
+    return None if not distance > max(DISPLACEMENT_TOLERANCE, 3.0 * std) else Refusal(
         Obstacle.DISPLACED, f'displacements of odom and of the {other} differ by '
         f'{distance:.1f} m in {DISPLACEMENT_WINDOW:g} s')

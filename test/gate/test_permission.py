@@ -117,7 +117,7 @@ def test_nothing_but_a_request_undoes_a_moved_stick(events):
     assert not next_permission(permission, ('request', 15.0)).taken_over(15.0)
 
 
-def test_a_request_does_not_hide_that_the_pilot_may_have_taken_over():
+def test_a_request_does_not_hide_a_possible_takeover():
     lost = after(ASKED, seen(OURS), ('follow_silence', 5.1), ENDED)
     assert lost.announcement() == 'READY: giving back: hold requested'
     assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)

@@ -96,7 +96,8 @@ def test_acceleration_is_small_and_leads_into_heights(
         wanted, yaw, height, climb, lasted, marker_age, offset, a_max, airborne):
     limits = GateLimits(relative_flight=True, a_max=a_max)  # lowered in flight
     setpoint = judge(limits, full=replace(limits, a_max=20.0),
-                     command=Command(wanted, yaw, relative=True), airborne=airborne, place=Location(height, climb), offset=offset,
+                     command=Command(wanted, yaw, relative=True), airborne=airborne,
+                     place=Location(height, climb), offset=offset,
                      relative=Relative(lasted), source_age=marker_age)
     if setpoint.kind != COMMAND:
         assert not setpoint.acceleration.any()

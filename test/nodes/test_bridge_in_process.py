@@ -271,7 +271,7 @@ def test_it_publishes_estimate_battery_and_place_of_arming(make_bench):
     assert 'INACTIVE: offboard was not requested' in {state.data for state in states}
 
 
-def test_place_of_arming_is_unknown_without_odometry_or_after_jump(make_bench):
+def test_place_of_arming_is_unknown_after_an_odometry_jump(make_bench):
     bench = make_bench()
     places = bench.sent['mavlink_bridge/armed_at']
 

@@ -187,9 +187,10 @@ def test_bounds_stay_where_they_are_however_often_odometry_jumps() -> None:
     follower, reached = Follower(replace(PARAMS, altitude_max=3.0)), []
     for tick in range(600):
         if tick % 100 == 50:
-            follower.jumped = follower.jumped + [0.0, 0.0, 0.5 if tick % 200 == 50 else -0.8]
+            up = 0.5 if tick % 200 == 50 else -0.8
+            follower.jumped = follower.jumped + np.array([0.0, 0.0, up])
         above = 0.3 if tick < 400 else -0.3
-        follower.tick(seen(follower.now, follower.position + follower.jumped + [2.1, 0.0, above]))
+        follower.tick(seen(follower.now, follower.position + follower.jumped + (2.1, 0.0, above)))
         reached.append(follower.position[2])
     assert max(reached) == pytest.approx(2.9, abs=0.05)
     assert reached[-1] == pytest.approx(1.1, abs=0.05)
