@@ -57,6 +57,7 @@ SEED_STEP = 1_000_000  # runs of one seed, as for ``flock_desk.flights``
 NEAR = 0.6, 0.9  # m: nearest distances that the table counts
 COMING = {0.5: 0.45, 1.0: 0.9, 2.0: 1.06}  # m/s of a leader that comes back, by v_max
 WAIT = 2.0  # s for which the leader hovers first
+FASTEST_WANDER = 1.5  # m/s: some draws of a faster leader exceed its acceleration
 HIGH = 20.0  # m: altitude at the start of flights whose leader moves up and down
 
 
@@ -158,7 +159,9 @@ def _jerk() -> Iterator[Cell]:
                  'reverses': legs((6.0, speed, 0.0, 0.0), (6.0, -speed, 0.0, 0.0),
                                   (6.0, speed, 0.0, 0.0), (6.0, -speed, 0.0, 0.0))}
         for motion in ('circle', 'figure_eight', 'wander'):
-            kinds[motion] = LeaderMotion(motion, WAIT, (speed, speed), size=wide, heading='away')
+            fastest = min(speed, FASTEST_WANDER) if motion == 'wander' else speed
+            kinds[motion] = LeaderMotion(
+                motion, WAIT, (fastest, fastest), size=wide, heading='away')
         for motion in ('spline', 'random_walk', 'stairs', 'approach'):
             kinds[motion] = LeaderMotion(motion, WAIT, (speed, speed), climb=0.3 * v,
                                          heading='away')

@@ -169,7 +169,9 @@ class Permission:
 
     def _stop_sending(self, why: str, cause: Cause) -> Permission:
         """Return the permission that sends nothing; a stick that was moved still counts."""
-        return Permission(reason=why, received=self.received, cause=cause, taker=self.taker)
+        stopped = Permission(reason=why, cause=cause)
+        return stopped if self.taker != STICK else replace(
+            stopped, received=self.received, taker=STICK)
 
     def contest(self, who: str) -> Permission:
         """Brake, because two nodes give commands at once."""

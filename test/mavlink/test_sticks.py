@@ -253,9 +253,11 @@ def test_the_end_of_the_bridge_does_not_undo_a_moved_stick():
     flight = Flight().follow(1.0)
     flight.controller._sticks = True
     flight.bridge.housekeeping.parameters.take_version(version(1, 18))
-    flight.bridge.sticks.moved = True
-    while flight.mode != 'POSCTL':
-        flight.fly(0.01)
+    flight.bridge.sticks.has_moved = True
+    for _ in range(200):
+        if flight.mode != 'POSCTL':
+            flight.fly(0.01)
+    assert flight.mode == 'POSCTL'
     flight.bridge.stop(flight.now)
     assert flight.bridge.gate.flies  # no HEARTBEAT has shown it yet
     flight.bridge.finish(flight.now)

@@ -362,7 +362,8 @@ def test_faults_of_autopilot_and_link_are_reported(make_bench):
     bench.wait(lambda: bench.bridge.alive(time.monotonic()))
     bench.node._report.problems._start -= 4.0
     found = bench.problems()
-    for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION', 'forward_odometry: none sent',
+    for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION',
+                 'forward_odometry: no ODOMETRY sent yet',
                  'mavlink_bridge/offboard to request offboard'):
         assert part in found
     bench.receive()

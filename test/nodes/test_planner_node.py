@@ -193,7 +193,7 @@ def test_every_other_input_arrives_unknown_ones_are_counted(rig: Rig) -> None:
     assert rig.values['leader_is'] == 'leader, seen' and rig.values['edges'] == 'leader'
     assert (rig.values['nearest_m'], rig.values['farthest_m']) == ('1.000', '2.828')
     rig.run(0.9, (0.8, 0.0, 2.0))  # half a second of it is taken for a jump
-    assert rig.values['warnings'].startswith('leader 0.80 m away')
+    assert rig.values['warnings'].startswith('leader is too close: 0.80 m')
     assert rig.values['warnings'] in rig.problems()
     rig.run(1.1, topic='neighbors/heard')
     assert rig.values['follower_2_is'] == 'follower, heard'

@@ -231,7 +231,8 @@ class BridgeProblems:
     def _forwarding_fault(self, now: float) -> str:
         forwarder = self._bridge.forwarder
         silence = 0.0 if forwarder is None else forwarder.silence(now)
-        return f'forward_odometry: no ODOMETRY sent for {silence:.1f} s' if (
+        return 'forward_odometry: no ODOMETRY sent' + (
+            f' for {silence:.1f} s' if math.isfinite(silence) else ' yet') if (
             silence > FORWARDING_GAP and self._bridge.alive(now)) else ''
 
     def _setpoint_problem(self, now: float) -> Problem | None:
