@@ -33,8 +33,9 @@ from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.ranges import Range
 from flock_follower.settings import refuse
 
-ORIGIN_RANGES = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
-          'height': Range(-10_000.0, 10_000.0, 'm')}
+ORIGIN_RANGES = {
+    'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
+    'height': Range(-10_000.0, 10_000.0, 'm')}
 MAVLINK_BRIDGE = [
     Spec('connection', 'udpin:127.0.0.1:14540',
          'connection to the autopilot: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
