@@ -74,7 +74,8 @@ MAX_JUMP = 0.5
 #: m: odometry farther from its prediction has another frame than before: places in the old frame
 #: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source. The rules
 #: differ in their prediction (``OdometrySource``, ``planner.memory``, ``peers.leapt``,
-#: ``odometry_forwarding.jumped``, ``velocity_check.Path``), and each says why.
+#: ``odometry_forwarding.has_jumped``, ``velocity_check.Path``, ``bridge_report``), and each says
+#: why.
 ODOMETRY_JUMP = 0.25
 #: m: a neighbor's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5
@@ -161,6 +162,11 @@ class OdometryState(NamedTuple):
     twist_rotation: Array
     derived: bool = False
     acceleration: Array | None = None
+
+    def error_of_prediction(self, before: OdometryState, elapsed: float) -> Array:
+        """Return the position (3,), m, less that predicted from ``elapsed`` s before."""
+        return self.position - before.position - (
+            0.5 * (before.velocity + self.velocity) * elapsed)
 
     @property
     def velocity_covariance(self) -> Array:

@@ -133,8 +133,7 @@ def leapt(before: OdometryState, now: OdometryState) -> str:
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
     if not 0.0 <= elapsed <= PREDICTION_TIME:
         return ''
-    expected = before.position + 0.5 * elapsed * (before.velocity + now.velocity)
-    off = math.dist(expected, now.position)
+    off = math.hypot(*now.error_of_prediction(before, elapsed))
     turn = abs(wrap_angle(yaw_from_quaternion(now.quaternion)
                           - yaw_from_quaternion(before.quaternion)))
     if off > ODOMETRY_JUMP + 0.5 * MAX_PUSH * elapsed ** 2:

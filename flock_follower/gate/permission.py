@@ -164,8 +164,9 @@ class Permission:
     def _giving_back(self, why: str, cause: Cause) -> Permission:
         # Another request does not undo a takeover, or that one may have gone unseen.
         unseen = self.phase is Phase.GIVING_BACK and self.cause is Cause.MODE_UNKNOWN
-        return replace(self, phase=Phase.GIVING_BACK, reason=why, cause=self.cause if (
-            unseen) else cause, taker=STICK if cause is Cause.STICK else self.taker)
+        return replace(self, phase=Phase.GIVING_BACK, reason=why,
+                       cause=Cause.MODE_UNKNOWN if unseen else cause,
+                       taker=STICK if cause is Cause.STICK else self.taker)
 
     def _stop_sending(self, why: str, cause: Cause) -> Permission:
         """Return the permission that sends nothing; a stick that was moved still counts."""

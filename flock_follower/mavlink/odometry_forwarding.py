@@ -137,8 +137,7 @@ def has_jumped(before: OdometryState, then: float, after: OdometryState, now: fl
     steps by which ``derivation`` restarts its filter must not count.
     """
     dt = now - then
-    mean_velocity = 0.5 * (before.velocity + after.velocity)
-    position_error = after.position - before.position - mean_velocity * dt
+    position_error = after.error_of_prediction(before, dt)
     attitude_error = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
     attitude_error = attitude_error - 0.5 * (before.angular_velocity + after.angular_velocity) * dt

@@ -56,7 +56,7 @@ HEADERS: Final = {
     'Cross-Origin-Opener-Policy': 'same-origin', 'Cache-Control': 'no-store'}
 PAGES_MAX = 24
 CONNECTIONS_MAX = 64  # a further one ends the oldest that is no open page
-BACKLOG = 16  # connections that wait to be accepted
+LISTEN_BACKLOG = 16  # connections that wait to be accepted
 CONNECTION_TIME = 30.0  # s for which a connection may last that is no open page
 ANSWERS_MAX = 8  # that wait for a slow page
 LONGEST_REQUEST = 1024  # bytes of a message from a page
@@ -184,7 +184,7 @@ class PageServer:
             self.application(), access_log=None, shutdown_timeout=STOP_TIMEOUT)
         await self._runner.setup()
         self._listener = await self._loop.create_server(
-            self._accept, self.access.host, self.port, backlog=BACKLOG)
+            self._accept, self.access.host, self.port, backlog=LISTEN_BACKLOG)
         self.port = self._listener.sockets[0].getsockname()[1]
 
     def _accept(self) -> asyncio.BaseProtocol:

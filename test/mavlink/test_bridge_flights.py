@@ -104,7 +104,7 @@ def test_a_blind_landing_is_not_reported_in_the_next_flight(disarms):
     assert flight.bridge.blind_landing.outcome.success
     flight.forwards = flight.odometry = True
     flight.fly(1.5)
-    if disarms:  # whoever arms it next
+    if disarms:
         flight.fly_until(lambda: not flight.bridge.telemetry.status.armed, 15.0)
     else:
         outcome = flight.ask('offboard', True)

@@ -254,9 +254,9 @@ def test_the_end_of_the_bridge_does_not_undo_a_moved_stick():
     flight.controller._sticks = True
     flight.bridge.housekeeping.parameters.take_version(version(1, 18))
     flight.bridge.sticks.has_moved = True
-    for _ in range(200):
-        if flight.mode != 'POSCTL':
-            flight.fly(0.01)
+    deadline = flight.now + 2.0
+    while flight.mode != 'POSCTL' and flight.now < deadline:
+        flight.fly(0.01)  # shorter than the period of HEARTBEAT
     assert flight.mode == 'POSCTL'
     flight.bridge.stop(flight.now)
     assert flight.bridge.gate.flies  # no HEARTBEAT has shown it yet

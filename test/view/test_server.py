@@ -267,7 +267,7 @@ def test_connections_beyond_the_limit_end_the_oldest_one(rig: Rig) -> None:
             ended = await asyncio.wait_for(idle[0][0].read(), 10.0)
         except ConnectionResetError:
             ended = b''
-        async with session.get(rig.origin) as reply:  # whoever holds sockets shuts out nobody
+        async with session.get(rig.origin) as reply:  # a page opens beside them
             status = reply.status
         await page.receive_json()
         rig.server.send_history({})
