@@ -16,17 +16,17 @@
 The situation of one decision: all inputs of ``setpoint_rules.decide`` as one value.
 
 The gate collects its inputs into a ``Situation``, and ``decide`` turns it into a setpoint.
-``to_json`` writes it as one line, ``from_json`` reads it: a decision can be made again.
+``to_json`` writes it as one line; ``read_situation`` reads it: a decision can be made again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 import enum
 import json
 import math
-from typing import Any, get_args, get_type_hints, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -113,12 +113,6 @@ class Situation:
         """Return the situation as one line of JSON, with NaN and Infinity as in Python."""
         return json.dumps(_plain_value(self))
 
-    @classmethod
-    def from_json(cls, line: str) -> Situation:
-        """Return the situation of a line of ``to_json``; equal bit for bit, arrays as arrays."""
-        situation: Situation = _read_value(cls, json.loads(line))
-        return situation
-
 
 def _plain_value(value: Any) -> Any:
     if isinstance(value, enum.Enum):
@@ -130,16 +124,3 @@ def _plain_value(value: Any) -> Any:
 
 def _names(kind: Any) -> Iterator[str]:
     return (field.name for field in fields(kind)) if is_dataclass(kind) else iter(kind._fields)
-
-
-def _read_value(hint: Any, plain: Any) -> Any:
-    """Return a value of a type, or of one type of a union, from its ``_plain_value``."""
-    kinds = get_args(hint) or (hint,)
-    if isinstance(plain, Mapping):
-        kind = next(kind for kind in kinds if is_dataclass(kind) or hasattr(kind, '_fields'))
-        hints = get_type_hints(kind)
-        return kind(**{name: _read_value(hints[name], each) for name, each in plain.items()})
-    if isinstance(plain, str) and (
-            kind := next((k for k in kinds if isinstance(k, enum.EnumMeta)), None)):
-        return kind[plain]
-    return np.array(plain) if isinstance(plain, list) else plain

@@ -25,9 +25,10 @@ from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.obstacle import Obstacle
 from flock_follower.gate.permission import MODE_TIMEOUT
+from flock_follower.gate.recorded_situation import read_situation
 from flock_follower.gate.relative_flight import Relative
 from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, LEVEL, NONE
-from flock_follower.gate.situation import Held, Situation
+from flock_follower.gate.situation import Held
 from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     FUTURE_TOLERANCE,
@@ -123,7 +124,7 @@ def test_any_situation_sends_nothing_unsafe_unpermitted_or_stale(given):
 def test_situation_read_from_its_line_decides_the_same(given):
     line = given.to_json()
     assert '\n' not in line
-    again = Situation.from_json(line)
+    again = read_situation(line)
     assert again.to_json() == line
     setpoint, before = decide(again), decide(given)
     assert setpoint._replace(acceleration=None) == before._replace(acceleration=None)

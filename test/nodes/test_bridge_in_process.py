@@ -36,8 +36,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.bridge_state import REFUSED
 from flock_follower.command_messages import Command, trajectory
+from flock_follower.gate.recorded_situation import read_situation
 from flock_follower.gate.setpoint_rules import COMMAND
-from flock_follower.gate.situation import Situation
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
 from flock_follower.mavlink.commands import Outcome
@@ -219,7 +219,7 @@ def test_limits_only_fall_in_flight_second_commander_brakes(make_bench):
     begin = 'situation of the last decision: '
     bench.wait(lambda: any(text.startswith(begin) for text in bench.log))
     line = next(text for text in bench.log if text.startswith(begin)).removeprefix(begin)
-    assert Situation.from_json(line).report.armed
+    assert read_situation(line).report.armed
 
 
 def test_two_commanding_nodes_refuse_offboard_files_are_named(make_bench):
