@@ -77,12 +77,12 @@ def calibration() -> SimpleNamespace:
         roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0))
 
 
-def odometry_message(row: list[float]) -> SimpleNamespace:
+def odometry_message(row: list[float], child: str) -> SimpleNamespace:
     """Return a row of :func:`odometry_rows` as a message."""
     sec, nanosec = divmod(to_nanoseconds(row[1]), NANOSECONDS)
     return SimpleNamespace(
         header=SimpleNamespace(frame_id='odom', stamp=SimpleNamespace(sec=sec, nanosec=nanosec)),
-        child_frame_id='base_link',
+        child_frame_id=child,
         pose=SimpleNamespace(
             pose=SimpleNamespace(position=vector(row[2:5]), orientation=vector(row[5:9], 'xyzw')),
             covariance=np.diag(row[15:21]).ravel()),
@@ -96,10 +96,11 @@ class Observed(Observations):
     """Observations whose odometry is given as ``rows``, see :func:`odometry_rows`."""
 
     rows: list[list[float]] = field(default_factory=list)
+    child: str = 'base_link'
 
     def judged(self) -> list[Finding]:
         usual = _healthy(self.live)
-        if (self.rows, self.parameters, self.static_child) == (usual.rows, usual.parameters, None):
+        if (self.rows, self.parameters, self.child) == (usual.rows, usual.parameters, usual.child):
             self.own = _usual_motion(self.live)  # reading it takes longer than to judge most of it
         else:
             self.own = self.read_motion()
@@ -107,7 +108,7 @@ class Observed(Observations):
 
     def read_motion(self) -> OwnMotion:
         """Return the rows, read as our nodes read odometry."""
-        return read_own_motion(self, [(to_nanoseconds(row[0]), odometry_message(row))
+        return read_own_motion(self, [(to_nanoseconds(row[0]), odometry_message(row, self.child))
                                       for row in self.rows])
 
 

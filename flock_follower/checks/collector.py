@@ -95,10 +95,8 @@ class Collector:
         known.stamps.append(stamp)
         if message is None:
             return
-        if name == 'odom':
-            seen.child_frame = message.child_frame_id
-            if seen.own is None:
-                self._odometry.append((to_nanoseconds(arrival), message))
+        if name == 'odom' and seen.own is None:
+            self._odometry.append((to_nanoseconds(arrival), message))
         elif name in (RAW_IMAGES, COMPRESSED_IMAGES):
             self._image(message, arrival, stamp)
         elif name == 'camera_info':
@@ -254,9 +252,7 @@ def read_own_motion(seen: Observations, messages: list[tuple[int, Any]]) -> OwnM
         params = filled(SourceParams(), seen.parameters['relative_pose'], 'odom_')
     except (KeyError, ValueError):
         params = SourceParams()
-    motion = OwnMotion(OdometrySource(params))
-    if seen.static_child is not None and not any((*params.child_position, *params.child_rpy)):
-        motion.source.place_child(seen.static_child)
+    motion = OwnMotion(OdometrySource(params, seen.static))
     for arrival, message in messages:
         motion.take(message, arrival)
     return motion

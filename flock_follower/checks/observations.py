@@ -29,7 +29,6 @@ import numpy as np
 from flock_follower.checks.pose_path import PosePath
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
-from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.odometry.static_frames import StaticFrames
@@ -184,10 +183,6 @@ class Observations:
     nodes: list[str] = field(default_factory=list)
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     own: OwnMotion | None = None
-    child_frame: str = ''
-    """Of the newest ``odom``."""
-    static_child: Transform | None = None
-    """Pose of this frame on base_link by tf_static."""
     calibration: Any = None
     dictionary: str = ''
     marker_sides: dict[int, float] = field(default_factory=dict)

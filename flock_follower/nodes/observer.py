@@ -33,6 +33,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector, POSES
@@ -46,7 +47,7 @@ from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
-from flock_follower.nodes.support.inputs import best_effort, StaticChild
+from flock_follower.nodes.support.inputs import best_effort, StaticTransforms
 from flock_follower.nodes.support.middleware import shared_memory_size
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
@@ -79,6 +80,18 @@ COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom'
 BY_TYPE = {IMAGE: RAW_IMAGES, COMPRESSED: COMPRESSED_IMAGES, INFO: 'camera_info', ODOMETRY: 'odom'}
 
 
+class ObservedFrames(StaticTransforms):
+    """The frames of ``/tf_static`` for a node that no callback may end."""
+
+    def _subscribe(self, node: Node, kind: Any, qos: QoSProfile) -> None:
+        node.create_subscription(kind, '/tf_static', self.take_valid, qos)
+
+    def take_valid(self, message: Any) -> None:
+        """Take the valid transforms of a TFMessage."""
+        with suppress(ValueError):
+            self.take(message)
+
+
 class Observer(Node):
     """
     Listens, and fills observations.
@@ -93,7 +106,7 @@ class Observer(Node):
         self._seconds, self._remaps, self._camera = seconds, remaps, camera
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
-        self._static = StaticChild(self)
+        self._static = ObservedFrames(self)
         self.seen.static = self._static.frames
         self._simulated: float | None = None
         self._begin = time.monotonic() + DISCOVERY  # before, /clock may not be found
@@ -123,7 +136,6 @@ class Observer(Node):
         self.seen.duration = time.monotonic() - self._begin
         self.seen.machine = _machine(meter.worst())
         self._look_at_graph()
-        self.seen.static_child = self._static.transform(self.seen.child_frame)
         self._collector.finish(self._neighbors())
         return self.seen
 

@@ -58,7 +58,7 @@ from flock_follower.nodes.support.image_middleware import (
     avoid_shared_memory_for_images,
     receive_buffer_max,
 )
-from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, StaticChild
+from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, StaticTransforms
 from flock_follower.nodes.support.output import never_block_output
 from flock_follower.nodes.support.process import run, spin
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
@@ -111,7 +111,7 @@ class View(FlockNode):
         self._model: CameraModel | None = None
         self._perception = RemoteParameters(self, PERCEPTION, self._take_parameters)
         self._ask_at = 0.0  # s: when relative_pose may be asked again
-        self._static = StaticChild(self)
+        self._static = StaticTransforms(self)
         self._configure(CameraValues(''), 'raw', SourceParams())
         self._buttons: deque[str] = deque(maxlen=4)
         self._calls: list[tuple[str, Any, float]] = []
@@ -267,10 +267,8 @@ class View(FlockNode):
 
     def _configure(self, camera: CameraValues, transport: str, source: SourceParams) -> None:
         self._camera, self._transport = camera, transport
-        self._source = OdometrySource(source)
+        self._source = OdometrySource(source, self._static.frames)
         self._mounting = camera_mounting(camera.position, camera.rpy)
-        self._placed = ''  # the child frame of odom that was placed by tf_static
-        self._child_configured = any(source.child_position) or any(source.child_rpy)
         self._calibration, self._model = b'', None
 
     def _take_calibration(self, message: CameraInfo) -> None:
@@ -300,11 +298,6 @@ class View(FlockNode):
         return pose(sample) @ self._mounting if isinstance(sample, OdometrySample) else None
 
     def _take_odometry(self, message: Odometry) -> None:
-        child = message.child_frame_id
-        if not self._child_configured and child != self._placed and (
-                (known := self._static.transform(child)) is not None or self._placed):
-            self._placed = '' if known is None else child
-            self._source.place_child(known or Transform())
         state = self._source.take(message, self.get_clock().now().nanoseconds)
         self._source.new_events()  # relative_pose reports them
         if state is not None:

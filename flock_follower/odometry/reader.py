@@ -66,6 +66,7 @@ from flock_follower.odometry.derivation import (
     ODOMETRY_GAP,
     TwistFrame,
 )
+from flock_follower.odometry.static_frames import BASE, StaticFrames
 from flock_follower.ranges import Checked, parameter, Range
 
 #: If the reading of the velocity changes, the step is faded out with this time constant, s.
@@ -119,10 +120,18 @@ class OdometrySource:
 
     ``twist`` describes the frame of the velocity.
     ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
+    ``placement`` is the newest placement of the child frame by ``static``, as text.
+
+    :param static: frames that place the child frame of each message on base_link, unless
+        ``params`` place it. Frames may be added later.
     """
 
-    def __init__(self, params: SourceParams | None = None) -> None:
+    def __init__(self, params: SourceParams | None = None,
+                 static: StaticFrames | None = None) -> None:
         self.params = params or SourceParams()
+        self._static = StaticFrames() if static is None or any(
+            (*self.params.child_position, *self.params.child_rpy)) else static
+        self._placed = self.placement = ''
         self._std = np.array(self.params.std) ** 2
         self.twist = TwistFrame(self.params.twist_frame)
         self.events: list[tuple[str, str]] = []
@@ -143,6 +152,16 @@ class OdometrySource:
         self._is_base = bool(np.array_equal(T_base_child.rotation, np.eye(3)))
         self._levers = bool(T_base_child.translation.any())
         self._restart()
+
+    def _place(self, child: str) -> None:
+        """Place another child frame by the static frames; one that they lack is base_link."""
+        if child != self._placed and (
+                (pose := self._static.pose_on_base(child)) is not None or self._placed):
+            self.place_child(pose or Transform())
+            self._placed = '' if pose is None else child
+            self.placement = f'the child frame of odom, {child!r}, is taken as {BASE}' if (
+                pose is None) else (
+                f'{child} is at {pose.translation.round(3).tolist()} m on {BASE} by tf_static')
 
     def _restart(self) -> None:
         self._stamp: int | None = None
@@ -183,6 +202,7 @@ class OdometrySource:
 
         :raises ValueError: if position, attitude or stamp is invalid.
         """
+        self._place(message.child_frame_id)
         position, attitude = _pose(message)
         stamp = (read_stamp(message.header.stamp) or now + clock_shift) - clock_shift
         if not self._is_new(stamp, (message.header.frame_id, message.child_frame_id)):

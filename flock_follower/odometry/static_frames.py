@@ -21,6 +21,8 @@ import numpy as np
 from flock_follower.geometry import Transform
 from flock_follower.messages import SANE
 
+BASE = 'base_link'
+
 
 class StaticFrames:
     """The tree of static frames of the vehicle, from ``tf_static``."""
@@ -44,6 +46,10 @@ class StaticFrames:
         above, below = self._to_root(frame), self._to_root(on)
         common = next((name for name in above if name in below), None)
         return None if common is None else below[common].inverse() @ above[common]
+
+    def pose_on_base(self, child: str) -> Transform | None:
+        """Return ``T_base_child``; None if it is unknown, or base_link itself."""
+        return None if child in ('', BASE) else self.pose(child, BASE)
 
     def _to_root(self, frame: str) -> dict[str, Transform]:
         """Return ``T_ancestor_frame`` of the frame itself and its ancestors, nearest first."""

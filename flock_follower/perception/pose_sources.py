@@ -35,7 +35,7 @@ from flock_follower.geometry import Array, normalize_quaternion, Transform
 from flock_follower.messages import FARTHEST, SANE
 from flock_follower.neighbors_file import PoseSource
 from flock_follower.odometry.buffer import Missing
-from flock_follower.odometry.static_frames import StaticFrames
+from flock_follower.odometry.static_frames import BASE, StaticFrames
 from flock_follower.perception.look import Sighting
 from flock_follower.perception.observed_wait import ObservedWait
 from flock_follower.perception.range_tracking import Rejection
@@ -55,7 +55,6 @@ MOST_WAITING = 100  # poses, and frames: a bound on memory
 NEAREST_POSE = 0.05
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
 AXES_VARIANCE = 1e-4
-BASE = 'base_link'
 LATE_POSE = 0.1  # s after its stamp: a larger median is reported
 MANY_OUTLIERS = 0.02  # share of poses outside the gate that is reported
 

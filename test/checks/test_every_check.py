@@ -45,6 +45,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.prints import Fault as PrintFault
 from flock_follower.perception.prints import WRONG_BORDER
 from flock_follower.topic_names import OURS, TYPES
@@ -125,6 +126,14 @@ def together(*changes: Change) -> Change:
 def moved(name: str, to: str) -> Change:
     """Return a change that publishes one of our topics under another name."""
     return lambda seen: seen.topics.update({to: seen.topics.pop(seen.names[name])})
+
+
+def static_frames(rpy: tuple[float, float, float]) -> StaticFrames:
+    """Return the frames of a vehicle whose IMU is turned so on base_link."""
+    frames = StaticFrames()
+    frames.add('base_link', 'imu', Transform.from_quaternion(
+        np.zeros(3), quaternion_from_rpy(*rpy)))
+    return frames
 
 
 def child_axes(*rpy: float) -> Change:
@@ -438,8 +447,7 @@ FAULTS: list[Fault] = [
           together(change(shifts=shift_rows(offset=0.05)), parameter(
               'relative_pose', 'time_offset', -0.05))),
     Fault('the pose by tf_static is used', LIVE, OK, 'odom up', 'leans', '', together(
-        child_axes(*OPTICAL), change(static_child=Transform.from_quaternion(
-            np.zeros(3), quaternion_from_rpy(*OPTICAL))))),
+        child_axes(*OPTICAL), change(child='imu', static=static_frames(OPTICAL)))),
     Fault('a leader that moves', LIVE, UNMEASURED, 'marker size', 'the leader moves', '',
           lambda seen: [row.__setitem__(2, row[2] + 0.3 * math.sin(0.4 * n))
                         for n, row in enumerate(seen.sightings)]),

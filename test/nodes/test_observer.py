@@ -54,8 +54,8 @@ def test_invalid_messages_do_not_end_the_observation(ros: None, monkeypatch: Any
     assert observer.seen.topics['/odom'].stamps == [0.0]
     wrong = TransformStamped(child_frame_id='imu')
     wrong.header.frame_id, wrong.transform.rotation.w = 'base_link', 0.0
-    observer._static._take_valid(SimpleNamespace(transforms=[wrong]))
-    assert observer._static.transform('imu') is None
+    observer._static.take_valid(SimpleNamespace(transforms=[wrong]))
+    assert observer.seen.static.pose_on_base('imu') is None
     observer.destroy_node()
 
 

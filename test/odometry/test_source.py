@@ -31,9 +31,11 @@ from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
     quaternion_to_matrix,
+    Transform,
 )
 from flock_follower.messages import odometry, OdometryState, set_quaternion, set_vector
 from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.odometry.static_frames import StaticFrames
 
 START = 1_700_000_000_000_000_000
 RATE = 100
@@ -258,6 +260,26 @@ def test_another_frame_begins_anew() -> None:
     other.header.frame_id = 'map'
     assert source.take(other, START) is not None
     assert [reason for reason, _ in source.new_events()] == ['odom changed its frames']
+
+
+@pytest.mark.parametrize('configured', [False, True])
+def test_static_frames_place_each_child_unless_configured(configured: bool) -> None:
+    frames, x = StaticFrames(), 0.5
+    frames.add('base_link', 'imu', Transform(np.eye(3), np.array([x, 0.0, 0.0])))
+    params = SourceParams(child_position=(0.2, 0.0, 0.0)) if configured else SourceParams()
+    source = OdometrySource(params, frames)
+    for k, (child, offset) in enumerate((
+            ('base_link', 0.0), ('imu', x), ('base_link', 0.0), ('unknown', 0.0), ('imu', x))):
+        sent = message(0.1 * k)
+        sent.child_frame_id = child
+        sent.pose.pose.orientation.x = sent.pose.pose.orientation.y = 0.0
+        sent.pose.pose.orientation.z, sent.pose.pose.orientation.w = 0.0, 1.0
+        place = taken(source, sent, 0.1 * k).position
+        assert sent.pose.pose.position.x - place[0] == pytest.approx(
+            0.2 if configured else offset), child
+        line = f'imu is at [{x}, 0.0, 0.0] m on base_link by tf_static'
+        assert source.placement == ('' if configured or not k else line if child == 'imu' else (
+            "the child frame of odom, 'base_link', is taken as base_link"))
 
 
 def test_latency_and_period_are_told() -> None:

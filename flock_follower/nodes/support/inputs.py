@@ -17,11 +17,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from typing import Any, Protocol
 
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from flock_follower.geometry import Transform
@@ -33,7 +31,6 @@ from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.parameters.spec import filled
 
-BASE = 'base_link'
 TRANSFORMS_BYTES_MAX = 65536  # bytes of a message on /tf_static: about 500 transforms
 #: Reliable, and the last message is kept for subscribers that start later. Never KEEP_ALL: a
 #: stopped subscriber would block the publisher.
@@ -73,21 +70,21 @@ class NodeClock(Protocol):
         """Return whether a stamp, ns, can be used."""
 
 
-class StaticChild:
+class StaticTransforms:
     """The frames of ``/tf_static``; empty without tf2_msgs, as in the PyPI runtime."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Any) -> None:
         self.frames = StaticFrames()
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
             return
-        qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        if isinstance(node, FlockNode):
-            node.subscribe(TFMessage, '/tf_static', self.take, qos, required=False,
-                           largest=TRANSFORMS_BYTES_MAX)
-        else:
-            node.create_subscription(TFMessage, '/tf_static', self._take_valid, qos)
+        self._subscribe(node, TFMessage, QoSProfile(
+            depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+
+    def _subscribe(self, node: Any, kind: Any, qos: QoSProfile) -> None:
+        node.subscribe(kind, '/tf_static', self.take, qos, required=False,
+                       largest=TRANSFORMS_BYTES_MAX)
 
     def take(self, message: Any) -> None:
         """
@@ -97,20 +94,11 @@ class StaticChild:
         """
         for_each(message.transforms, self._add)
 
-    def _take_valid(self, message: Any) -> None:
-        """Take the valid transforms of a TFMessage: for a node that no callback may end."""
-        with suppress(ValueError):
-            self.take(message)
-
     def _add(self, stamped: Any) -> None:
         turn = stamped.transform.rotation
         self.frames.add(
             stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
                 to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
-
-    def transform(self, child: str) -> Transform | None:
-        """Return ``T_base_child``; None if it is unknown, or base_link itself."""
-        return None if child in ('', BASE) else self.frames.pose(child, BASE)
 
 
 class OwnOdometry:
@@ -126,33 +114,28 @@ class OwnOdometry:
     def __init__(self, node: FlockNode, values: Mapping[str, Any],
                  use: Callable[[OdometryState, int], None], clock: NodeClock | None = None,
                  depth: int = 200, **options: Any) -> None:
-        self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
-        self._node, self._use, self._clock, self._placed = node, use, clock, ''
-        self._found = ''  # the frame of the velocity that was logged
+        self._node, self._use, self._clock, self._static = node, use, clock, StaticTransforms(node)
+        self.source = OdometrySource(
+            filled(SourceParams(), values, 'odom_'), self._static.frames)
+        self._found = self._placement = ''  # of the velocity and the child, as logged
         node.diagnostics.checks.append(self._problem)
         node.diagnostics.sources.append(self._values)
-        configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
-        self._static = None if configured else StaticChild(node)
         self.poll = node.poll(Odometry, 'odom', self._take, best_effort(depth), **options)
         """Takes the messages that wait, see ``FlockNode.poll``."""
 
     def _take(self, message: Odometry, arrival: int) -> None:
-        child, clock_shift = message.child_frame_id, 0
+        clock_shift = 0
         if self._clock is not None:
             self._clock.now()
             clock_shift = self._clock.clock_shift
             if not self._clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
                 return
-        if self._static and child != self._placed and (
-                (pose := self._static.transform(child)) is not None or self._placed):
-            self._placed = '' if pose is None else child  # a static transform is passed once
-            self.source.place_child(pose or Transform())
-            self._node.get_logger().info(
-                f'the child frame of odom, {child!r}, is taken as {BASE}' if pose is None else
-                f'{child} is at {pose.translation.round(3).tolist()} m on {BASE} by tf_static')
         state = self.source.take(message, arrival - clock_shift, clock_shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
+        if self.source.placement != self._placement:
+            self._placement = self.source.placement
+            self._node.get_logger().info(self._placement)
         if self.source.twist.found != self._found:
             self._found = self.source.twist.found
             self._node.get_logger().info(f'velocity of odom: {self.source.twist.describe}')

@@ -31,7 +31,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WAR
 from flock_follower.nodes.support.inputs import (
     best_effort,
     for_each,
-    StaticChild,
+    StaticTransforms,
     TRANSFORMS_BYTES_MAX,
 )
 from flock_follower.nodes.support.runtime import FlockNode
@@ -84,7 +84,7 @@ class PoseInputs:
                              'frames_topic: each neighbor must have a pose_topic of its own')
         if self._transforms:
             self._subscribe_transforms(own_frames)
-        perceiver.sources.static = StaticChild(node).frames
+        perceiver.sources.static = StaticTransforms(node).frames
         node.diagnostics.checks.append(self._problem)
         node.create_timer(LOOK_PERIOD, self.subscribe_available, clock=STEADY)
         self.subscribe_available()
