@@ -37,7 +37,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from flock_follower.acceleration_messages import ACCELERATION, from_acceleration, with_acceleration
-from flock_follower.command_messages import Command, from_trajectory, trajectory
+from flock_follower.command_messages import Command, from_trajectory, TRAJECTORY, trajectory
 from flock_follower.flock.exchange import Sharing
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
@@ -53,7 +53,6 @@ from flock_follower.messages import (
     stamp_age,
     STATE,
     to_nanoseconds,
-    TRAJECTORY,
 )
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver

@@ -33,14 +33,18 @@ from flock_follower.messages import (
     set_vector,
     stamp_age,
     to_array,
-    TRAJECTORY,
     twist,
 )
 
+TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 #: The names of further joints of a command, see :func:`trajectory`; all are on the wire.
 SEPARATION_JOINT, ALTITUDE_JOINT, RETREAT_JOINT = 'separation', 'altitude', 'retreat'
 #: Time without odometry, s, for which the gate keeps the velocity of the retreat.
 ODOMETRY_GAP = 3.0
+#: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
+RELATIVE_ACCELERATION_MAX = 1.0
+#: Oldest image that such a command may rest on, s.
+OLDEST_MARKER = 0.5
 
 
 class Command(NamedTuple):

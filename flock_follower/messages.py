@@ -23,7 +23,8 @@ build a message, the caller passes ``make``, which returns an empty message of a
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+import math
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,18 +41,12 @@ NANOSECONDS = 1_000_000_000
 _NANOSEC = Range(0, NANOSECONDS - 1, whole=True)
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
-RANGE = 'sensor_msgs/msg/Range'
-TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
 RELATIVE = 'flock_relative'
 #: Topic on which the bridge publishes that motion during flight without odometry.
 MOTION_TOPIC = 'mavlink/relative'
-#: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
-RELATIVE_ACCELERATION_MAX = 1.0
-#: Oldest image that such a command may rest on, s.
-OLDEST_MARKER = 0.5
 #: Suffix of a neighbor's name on ``neighbors``: another object with the same marker. The planner
 #: avoids it, and never follows it.
 DUPLICATE = '/duplicate'
@@ -72,10 +67,9 @@ FUTURE_TOLERANCE = 0.1
 #: s: a stamp farther back is a new start (a bag played again), not a message out of order.
 MAX_JUMP = 0.5
 #: m: odometry farther from its prediction has another frame than before: places in the old frame
-#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source. The rules
-#: differ in their prediction (``OdometrySource``, ``planner.memory``, ``peers.leapt``,
-#: ``odometry_forwarding.has_jumped``, ``velocity_check.Path``, ``bridge_report``), and each says
-#: why.
+#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source. ``jump``
+#: is the rule. Two others predict otherwise: ``derivation`` has positions alone, and
+#: ``velocity_check.Path`` allows for motion in a gap.
 ODOMETRY_JUMP = 0.25
 #: m: a neighbor's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5
@@ -163,16 +157,36 @@ class OdometryState(NamedTuple):
     derived: bool = False
     acceleration: Array | None = None
 
-    def error_of_prediction(self, before: OdometryState, elapsed: float) -> Array:
-        """Return the position (3,), m, less that predicted from ``elapsed`` s before."""
-        return self.position - before.position - (
-            0.5 * (before.velocity + self.velocity) * elapsed)
-
     @property
     def velocity_covariance(self) -> Array:
         """Return the covariance (3, 3) of the velocity in the header's frame."""
         turned: Array = self.twist_rotation @ self.twist_covariance[:3, :3] @ self.twist_rotation.T
         return turned
+
+
+class Moving(Protocol):
+    """A state with a position (3,), m, and a velocity (3,), m/s."""
+
+    @property
+    def position(self) -> Array:
+        """Return the position."""
+
+    @property
+    def velocity(self) -> Array:
+        """Return the velocity."""
+
+
+def jump(before: Moving, after: Moving, elapsed: float, tolerance: float) -> float:
+    """
+    Return the distance, m, of a position from its prediction if it exceeds a tolerance, else 0.
+
+    The prediction is from ``elapsed`` s before, with the mean of both velocities: exact for a
+    constant acceleration.
+    """
+    distance = math.dist(after.position.tolist(), [
+        x + 0.5 * elapsed * (v + w) for x, v, w in zip(
+            before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())])
+    return distance if distance > tolerance else 0.0
 
 
 def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:

@@ -19,13 +19,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from flock_follower.messages import ODOMETRY, RANGE, STATE, TRAJECTORY
+from flock_follower.command_messages import TRAJECTORY
+from flock_follower.messages import ODOMETRY, STATE
 
 #: The nodes that a flight needs.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
 IMAGE: Final = 'sensor_msgs/msg/Image'
 COMPRESSED: Final = 'sensor_msgs/msg/CompressedImage'
 INFO: Final = 'sensor_msgs/msg/CameraInfo'
+RANGE: Final = 'sensor_msgs/msg/Range'
 RAW_IMAGES: Final = 'image_raw'
 COMPRESSED_IMAGES: Final = 'image_raw/compressed'
 

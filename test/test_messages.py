@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -25,10 +25,11 @@ import pytest
 from flock_follower.acceleration_messages import acceleration, from_acceleration
 from flock_follower.bags.message_types import empty
 from flock_follower.command_messages import Command, from_trajectory, trajectory
-from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
+from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import (
     from_odometry,
     from_state,
+    jump,
     Make,
     odometry,
     RELATIVE,
@@ -47,6 +48,21 @@ BOTH = pytest.mark.parametrize('new', [pytest.param(rclpys, marks=pytest.mark.ro
 SECOND = 10**9
 COMMAND = Command(np.array([0.5, -1.0, 0.25]), -2.0, 0.3, np.array([0.6, 0.0, 0.8]), 'odom',
                   3 * SECOND + 7, SECOND // 4, 0.4)
+
+
+class Placed(NamedTuple):
+    position: Array
+    velocity: Array
+
+
+@pytest.mark.parametrize('elapsed', [-0.1, 0.0, 0.02, 3.0])
+def test_a_jump_is_a_distance_beyond_the_tolerance(elapsed: float) -> None:
+    v, a = np.array([1.0, -2.0, 0.5]), np.array([0.3, 3.0, -1.0])
+    before = Placed(np.array([4.0, 5.0, 6.0]), v)
+    there = before.position + elapsed * v + 0.5 * elapsed ** 2 * a
+    for step, distance in ((0.24, 0.0), (0.26, 0.26), (0.0, 0.0), (np.nan, 0.0)):
+        after = Placed(there + step * np.array([0.6, 0.0, -0.8]), v + elapsed * a)
+        assert jump(before, after, elapsed, 0.25) == pytest.approx(distance)
 
 
 @BOTH

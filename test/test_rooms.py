@@ -47,7 +47,7 @@ ROOMS = {
     # NED is inside what speaks MAVLink.
     'ned': ('', 'numpy'),
     'bridge_state': ('', ''),
-    'topic_names': ('messages', ''),
+    'topic_names': ('command_messages messages', ''),
     # The markers by name and size alone: the planner reads the file, too.
     'neighbors_file': ('', 'yaml'),
     'odometry': ('messages', 'numpy'),

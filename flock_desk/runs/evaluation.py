@@ -46,6 +46,7 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
+from flock_follower.command_messages import TRAJECTORY
 from flock_follower.files import resource
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
@@ -59,7 +60,6 @@ from flock_follower.messages import (
     OdometryState,
     read_stamp,
     STATE,
-    TRAJECTORY,
 )
 from flock_follower.neighbors_file import load, NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams

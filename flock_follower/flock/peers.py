@@ -30,7 +30,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle, yaw_from_quaternion
-from flock_follower.messages import FASTEST, NANOSECONDS, ODOMETRY_JUMP, OdometryState
+from flock_follower.messages import FASTEST, jump, NANOSECONDS, ODOMETRY_JUMP, OdometryState
 
 #: A vehicle's name: it goes into frame ids, and comes from a namespace. Its frame is NAME/odom.
 NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
@@ -127,17 +127,16 @@ def leapt(before: OdometryState, now: OdometryState) -> str:
     """
     Return the leap of an odometry between two of its states, as text, or ''.
 
-    A rule of its own: states of other vehicles come seconds apart, so their motion in between is
-    allowed for, and a leap of the yaw alone turns the frames against each other, too.
+    States of other vehicles come seconds apart, so the tolerance allows for their motion in
+    between. A leap of the yaw alone turns the frames against each other, too.
     """
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
     if not 0.0 <= elapsed <= PREDICTION_TIME:
         return ''
-    off = math.hypot(*now.error_of_prediction(before, elapsed))
     turn = abs(wrap_angle(yaw_from_quaternion(now.quaternion)
                           - yaw_from_quaternion(before.quaternion)))
-    if off > ODOMETRY_JUMP + 0.5 * MAX_PUSH * elapsed ** 2:
-        return f'by {off:.2f} m'
+    if by := jump(before, now, elapsed, ODOMETRY_JUMP + 0.5 * MAX_PUSH * elapsed ** 2):
+        return f'by {by:.2f} m'
     return f'by {turn:.2f} rad' if turn > TURN + MAX_SPIN * elapsed else ''
 
 

@@ -40,6 +40,7 @@ from flock_follower.geometry import (
 from flock_follower.mavlink.dialects import Dialect
 from flock_follower.messages import (
     FUTURE_TOLERANCE,
+    jump,
     ODOMETRY_STD,
     OdometryState,
     POSITION_JUMP,
@@ -133,15 +134,14 @@ def has_jumped(before: OdometryState, then: float, after: OdometryState, now: fl
     """
     Return whether a pose differs from its prediction from ``then``, s, or time decreased.
 
-    A rule of its own: each jump that is counted resets the autopilot's estimate, so the small
-    steps by which ``derivation`` restarts its filter must not count.
+    Each jump that is counted resets the autopilot's estimate, so the small steps by which
+    ``derivation`` restarts its filter must not count.
     """
     dt = now - then
-    position_error = after.error_of_prediction(before, dt)
     attitude_error = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
     attitude_error = attitude_error - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
-    return bool(dt < 0.0 or np.linalg.norm(position_error) > POSITION_JUMP
+    return bool(dt < 0.0 or jump(before, after, dt, POSITION_JUMP)
                 or np.linalg.norm(attitude_error) > ATTITUDE_JUMP)
 
 

@@ -28,11 +28,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.messages import FUTURE_TOLERANCE, ODOMETRY_JUMP
+from flock_follower.messages import FUTURE_TOLERANCE, jump, ODOMETRY_JUMP
 from flock_follower.planner.inputs import (
     distance_known,
     implausible,
-    Moving,
     Neighbor,
     OwnState,
     propagate,
@@ -209,14 +208,14 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 jumped, drag = own.stamp, memory.drag
             # From tick to tick, not from message to message: a jump between two ticks counts even
             # if the message of it was lost, and so does one of many small steps.
-            jump = 0.0 if me is None else prediction_error(own, me)
-            if jump > ODOMETRY_JUMP:
-                rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
+            by = 0.0 if me is None else jump(me, own, own.stamp - me.stamp, ODOMETRY_JUMP)
+            if by:
+                rejected.append(Rejection('odometry jumped', f'by {by:.2f} m'))
                 jumped = own.stamp
                 memory = memory._replace(
                     neighbors={}, flock={}, ranged={}, altitude=_after_jump(memory, own),
                     lost=None, leader=None, looking=False)
-            if me is not None and jump <= ODOMETRY_JUMP and own.stamp > me.stamp:
+            if me is not None and not by and own.stamp > me.stamp:
                 drag = _drag(memory, me, own, params)
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
@@ -240,7 +239,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         elif before is None or (before.received and not n.received):  # sightings come first
             kept[n.name] = n
         elif before.received == n.received and n.stamp >= before.stamp:
-            if (by := prediction_error(n, before)) > NEIGHBOR_JUMP:
+            if by := jump(before, n, n.stamp - before.stamp, NEIGHBOR_JUMP):
                 rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
                 kept[n.name] = n
@@ -300,9 +299,3 @@ def max_age(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
     return params.heard_timeout if n.received else params.predict_timeout
 
-
-def prediction_error(now: Moving, before: Moving) -> float:
-    """Return the distance of a state from its prediction by the state before, m."""
-    elapsed = now.stamp - before.stamp
-    return math.dist(now.position.tolist(), [x + elapsed * v for x, v in zip(
-        before.position.tolist(), before.velocity.tolist())])

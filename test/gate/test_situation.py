@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 from situations import situation
 
-from flock_follower.command_messages import Command
+from flock_follower.command_messages import Command, OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.obstacle import Obstacle
 from flock_follower.gate.permission import MODE_TIMEOUT
@@ -36,7 +36,6 @@ from flock_follower.gate.velocity_check import (
     ODOM,
     SourceMotion,
 )
-from flock_follower.messages import OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 
 ANY = st.floats() | st.floats(-4.0, 4.0)
 VECTOR = st.tuples(ANY, ANY, ANY)

@@ -191,6 +191,14 @@ def test_odometry_jump_takes_new_altitude_forgets_neighbors() -> None:
     assert not memory.neighbors
 
 
+def test_braking_in_a_pause_of_odometry_is_no_jump() -> None:
+    memory, _ = step(Memory(), 1.0, True, own(1.0, velocity=(1.5, 0.0, 0.0)), [], PARAMS)
+    for x, jumps in ((0.375, 0), (0.7, 1)):  # from 1.5 m/s to a stop within 0.5 s; 0.32 m beyond
+        after = own(1.5, (x, 0.0, 2.0))
+        decision = step(memory, 1.5, True, after, [], PARAMS)[1]
+        assert [r.reason for r in decision.rejected] == ['odometry jumped'] * jumps
+
+
 def test_odometry_that_comes_late_does_not_replace_newer() -> None:
     memory, _ = step(Memory(), 1.0, True, own(1.0), [leader(1.0)], PARAMS)
     memory, _ = step(memory, 1.1, True, own(0.9, velocity=(0.5, 0.0, 0.0)), [], PARAMS)

@@ -42,6 +42,7 @@ from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     from_state,
     FUTURE_TOLERANCE,
+    jump,
     MOTION_TOPIC,
     NANOSECONDS,
     ODOMETRY_JUMP,
@@ -232,11 +233,11 @@ def _changes_frame(before: OdometryState, after: OdometryState) -> bool:
     """
     Return whether odometry has another frame than before, by ODOMETRY_JUMP.
 
-    A rule of its own: the bridge takes each message, and one out of order is no other frame.
+    The bridge takes each message, and one out of order is no other frame.
     """
     elapsed = (after.stamp - before.stamp) / NANOSECONDS
     return after.frame != before.frame or elapsed < -FUTURE_TOLERANCE or (
-        math.hypot(*after.error_of_prediction(before, elapsed)) > ODOMETRY_JUMP)
+        jump(before, after, elapsed, ODOMETRY_JUMP) > 0.0)
 
 
 def _point(state: OdometryState) -> PointStamped:
