@@ -38,7 +38,7 @@ UNDELIVERED: Final = 'the transport delivers nothing'
 #: Where the shared memory is, and how the names of its files begin.
 SHARED_MEMORY: Final = Path('/dev/shm')
 _PREFIXES: Final = ('fastdds_', 'fastrtps_')
-_LOCK_SUFFIX: Final = '_el'
+LOCK_SUFFIX: Final = '_el'
 #: So the kernel marks an open file that was removed.
 _REMOVED: Final = ' (deleted)'
 
@@ -55,15 +55,6 @@ def opened_segment_names() -> list[str]:
         with contextlib.suppress(OSError):  # closed meanwhile by another thread
             opened.append(os.readlink(link))
     return [name for name in opened if _is_shared_memory(Path(name))]
-
-
-def largest_shared_memory() -> int:
-    """Return the size, bytes, of the largest shared-memory file that is open; else 0."""
-    sizes = [0]
-    for name in opened_segment_names():
-        with contextlib.suppress(OSError):  # removed
-            sizes.append(Path(name.removesuffix(_LOCK_SUFFIX)).stat().st_size)
-    return max(sizes)
 
 
 def undelivered(opened: Iterable[str], user: int, folder: Path = SHARED_MEMORY) -> str:
@@ -103,7 +94,7 @@ def _is_shared_memory(file: Path) -> bool:
 def lock_files(folder: Path) -> Iterator[Path]:
     """Yield the lock files of all processes."""
     for prefix in _PREFIXES:
-        yield from folder.glob(f'{prefix}*{_LOCK_SUFFIX}')
+        yield from folder.glob(f'{prefix}*{LOCK_SUFFIX}')
 
 
 def _user_name(user: int) -> str:

@@ -133,9 +133,8 @@ def _judge_path(its: SourceSeen, places: list[_Place], states: list[OdometryStat
     its.path = judge_path(
         np.array([(stamp - epoch) / NANOSECONDS for stamp in stamps]),
         np.array([by_stamp[stamp] for stamp in stamps]),
-        WholeOdometry([OdometrySample(
-            (state.stamp - epoch) / NANOSECONDS, state.position, state.quaternion,
-            state.velocity, state.angular_velocity, derived=state.derived) for state in near]),
+        WholeOdometry([OdometrySample.from_state(state, (state.stamp - epoch) / NANOSECONDS)
+                       for state in near]),
         its.on_body)
 
 

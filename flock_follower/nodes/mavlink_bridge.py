@@ -49,6 +49,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.command_messages import from_trajectory
+from flock_follower.fast_dds import opened_segment_names
 from flock_follower.gate.flight_end import CommandSources, EndParams
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase
@@ -67,7 +68,7 @@ from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import internal_error, STEADY
 from flock_follower.nodes.support.even_clock import EvenClock
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
-from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
+from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.output import never_block_output
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.publisher_thread import PublisherThread
@@ -151,7 +152,7 @@ class MavlinkBridge(FlockNode):
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
                                f'{values["connection"]}')
-        if shared_memory_size():
+        if opened_segment_names():
             self.get_logger().warning(
                 'Fast DDS shares memory with other processes here: connecting to one can '
                 'stop the setpoints for up to 1 s; config/dds/fastdds_udp.xml prevents that')

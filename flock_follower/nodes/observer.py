@@ -48,10 +48,10 @@ from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticTransforms
-from flock_follower.nodes.support.middleware import shared_memory_size
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS
+from flock_follower.nodes.support.shared_memory import shared_memory_size
 from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load

@@ -308,9 +308,8 @@ class View(FlockNode):
         if not self._flight.take_odometry(state, time.monotonic()):
             return
         self._epoch = self._epoch or state.stamp
-        self._odometry.add(OdometrySample(
-            (state.stamp - self._epoch) / NANOSECONDS, state.position, state.quaternion,
-            state.velocity, state.angular_velocity, derived=state.derived))
+        self._odometry.add(OdometrySample.from_state(
+            state, (state.stamp - self._epoch) / NANOSECONDS))
 
     def _take_distances(self, now: float) -> None:
         """Set the times of the new distances by their stamps; the last one is of now."""

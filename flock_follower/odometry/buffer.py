@@ -42,7 +42,7 @@ from flock_follower.geometry import (
     slerp,
     Transform,
 )
-from flock_follower.messages import FASTEST, MAX_JUMP
+from flock_follower.messages import FASTEST, MAX_JUMP, OdometryState
 
 #: Columns of a row, after the stamp.
 _POSITION, _VELOCITY, _RATE, _TRAVEL = (slice(k, k + 3) for k in range(1, 13, 3))
@@ -78,6 +78,12 @@ class OdometrySample(NamedTuple):
         return np.array((
             self.stamp, *self.position.tolist(), *self.velocity.tolist(),
             *self.angular_velocity.tolist(), *travel.tolist(), *self.quaternion.tolist()))
+
+    @classmethod
+    def from_state(cls, state: OdometryState, stamp: float) -> OdometrySample:
+        """Return the sample of a state, at a stamp, s."""
+        return cls(stamp, state.position, state.quaternion, state.velocity,
+                   state.angular_velocity, derived=state.derived)
 
     @classmethod
     def of_row(cls, row: Array) -> OdometrySample:

@@ -166,9 +166,8 @@ class Perceiver:
             self.tracker.restart()  # its estimates are in the old frame
             self.sources.restart()
         self.frame = state.frame
-        jumped = self.tracker.feed_odometry(OdometrySample(
-            self._seconds(state.stamp), state.position, state.quaternion, state.velocity,
-            state.angular_velocity, derived=state.derived))
+        jumped = self.tracker.feed_odometry(
+            OdometrySample.from_state(state, self._seconds(state.stamp)))
         if jumped:
             self._pending.clear()
             self.sources.restart()

@@ -43,7 +43,8 @@ LOOK = """
 import os
 import sys
 from flock_follower.checks.reach import find_reach
-from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
+from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.shared_memory import shared_memory_size
 if sys.argv[1] == 'avoid':
     avoid_shared_memory(os.environ)
 import rclpy

@@ -18,13 +18,10 @@ from __future__ import annotations
 
 from collections.abc import MutableMapping
 from pathlib import Path
-from typing import Final
 
-from flock_follower.fast_dds import largest_shared_memory, PROFILE_VARIABLES, profile_variables
+from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables
 from flock_follower.files import resource
 
-#: Share of a file of shared memory that is for messages (measured with Fast DDS 2.14 and 3.2).
-_SEGMENT_SHARE: Final = 64 / 67
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _OWN_PROFILE = 'config/dds/fastdds.xml'
@@ -38,7 +35,7 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     When it first sends to another process, Fast DDS 2.14 tests the shared-memory port of that
     process, sometimes for 333 ms, for 1 s if it was killed. A publisher waits meanwhile and holds
     the GIL: the whole process stops (eProsima/Fast-DDS issue 6535). Other middleware, and the
-    user's own settings, are left as they are; ``shared_memory_size`` shows the result.
+    user's own settings, are left as they are; ``opened_segment_names`` shows the result.
 
     :param environment: changed in place.
     """
@@ -58,11 +55,6 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
         environment.update(profile_variables(UDP_PROFILE))
     else:
         environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
-
-
-def shared_memory_size() -> int:
-    """Return the size, bytes, of the largest shared memory that Fast DDS sends through; or 0."""
-    return round(largest_shared_memory() * _SEGMENT_SHARE)
 
 
 def _is_own(profile: str) -> bool:
