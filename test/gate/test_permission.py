@@ -107,6 +107,11 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
 
+@pytest.mark.parametrize('events', [(), (ASKED,), (ASKED, seen(OURS)), (ASKED, LANDED)])
+def test_a_stick_takes_over_no_flight_that_none_took(events):
+    assert after(*events).name_taker(STICK, 5.0) == after(*events)
+
+
 @pytest.mark.parametrize('events', [
     (), (ENDED,), (('end', 'low battery'), seen(PILOT, 5.0)), (('fall_silent', 'no velocity'),),
     (ENDED, ('fall_silent', 'no velocity')), (LANDED,), (seen(DISARMED, 5.0),)])
