@@ -358,7 +358,7 @@ class Gate:
         self._height_watch.step(situation.place.height, self._commanded_height(
             setpoint, situation, now) if active and engaged else None)
         if not sends and not situation.withheld and situation.known.blind:
-            self.permit(self.permission.fall_silent(setpoint.reason))
+            self.permit(self.permission.fall_silent(setpoint.reason, report.mode_age))
         if flown.commanded:
             flown.held, flown.yaw = None, setpoint.yaw
 
