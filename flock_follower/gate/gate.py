@@ -246,8 +246,8 @@ class Gate:
     @property
     def wind(self) -> float:
         """Return the acceleration by the wind that setpoints offset, m/s^2."""
-        offset = self._disturbance.offset(self.autopilot.needs_wind_offset)
-        return float(np.linalg.norm(offset[:2]))
+        return float(np.linalg.norm(
+            self._disturbance.offset(self.autopilot.needs_wind_offset)[:2]))
 
     @property
     def thrust_offset(self) -> float:

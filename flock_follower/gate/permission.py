@@ -161,7 +161,11 @@ class Permission:
         """Brake after a request for hold, land, disarm or the end of the bridge."""
         if self.phase is Phase.READY and not self.obeyed:
             return Permission(reason=why, cause=cause)
-        return self._giving_back(why, cause) if self.streams else self
+        if self.streams:
+            return self._giving_back(why, cause)
+        # A stick that moved as the bridge stopped sending counts, too.
+        return replace(self, taker=STICK) if cause is Cause.STICK and (
+            self.phase is Phase.INACTIVE and math.isfinite(self.received)) else self
 
     def _giving_back(self, why: str, cause: Cause) -> Permission:
         # Another request does not undo a takeover, or that one may have gone unseen.

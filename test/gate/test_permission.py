@@ -117,6 +117,15 @@ def test_nothing_but_a_request_undoes_a_moved_stick(events):
     assert not next_permission(permission, ('request', 15.0)).taken_over(15.0)
 
 
+@pytest.mark.parametrize('ended', [
+    (('fall_silent', 'no velocity'),), (ENDED, seen(HOLD, 5.0))])
+def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
+    permission = after(ASKED, seen(OURS, 5.0), *ended, MOVED)
+    assert permission.phase is Phase.INACTIVE
+    assert permission.taken_over(14.9).startswith('the pilot took over')
+    assert not permission.taken_over(15.0) and after(MOVED) == Permission()
+
+
 UNSEEN = ('fall_silent', 'no velocity', 3.1)  # without a mode for so long, s
 
 
