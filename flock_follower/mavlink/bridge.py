@@ -370,9 +370,9 @@ class Bridge:
         """
         Send the final messages.
 
-        A vehicle that still flies our setpoints receives a hold command, or again the one by which
-        a pending request ends the flight: a landing, or the pilot's mode after a stick was moved;
-        none while its mode is unknown. The last message is a level setpoint, because autopilots
+        A vehicle that still flies our setpoints receives again the command by which a pending
+        request ends the flight, such as a landing; else the pilot's mode after a stick was moved,
+        or hold; none while its mode is unknown. The last message is a level setpoint, because autopilots
         obey it for up to seconds: after that time a braking one would make the vehicle fly
         backwards.
         """
@@ -381,8 +381,9 @@ class Bridge:
                 self.status(now) is not None):
             pending = self.requests.pending
             ends = pending is not None and pending.goal.ends_flight and pending.current.modes
+            moved = self.sticks.has_moved and self.housekeeping.watches_sticks()
             goal = pending.current if pending is not None and ends else (
-                commands.hold(self.telemetry.dialect))
+                commands.position if moved else commands.hold)(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)
         setpoint, _ = self._decide(now)
         if setpoint.kind != NONE:

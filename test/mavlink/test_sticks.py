@@ -311,3 +311,18 @@ def test_a_stick_moved_later_undoes_no_switch_to_hold(how):
                 manual_control(REST._replace(roll=0.8))])
             flight.fly(1.0 / RATE)
         assert flight.mode == mode
+
+
+@pytest.mark.slow
+def test_a_stick_that_moves_while_the_bridge_stops_counts():
+    flight, _ = ends_by_itself('hold')
+    flight.bridge.stop(flight.now)
+    for _ in range(2):
+        flight.wire.arrived += flight.autopilot._packed([
+            manual_control(REST._replace(roll=0.8))])
+        flight.fly(1.0 / RATE)
+    assert flight.mode == 'OFFBOARD'  # nothing more is requested before the end
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(0.1)
+    assert flight.mode == 'POSCTL'
