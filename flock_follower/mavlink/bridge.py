@@ -372,9 +372,9 @@ class Bridge:
 
         A vehicle that still flies our setpoints receives again the command by which a pending
         request ends the flight, such as a landing; else the pilot's mode after a stick was moved,
-        or hold; none while its mode is unknown. The last message is a level setpoint, because autopilots
-        obey it for up to seconds: after that time a braking one would make the vehicle fly
-        backwards.
+        or hold; none while its mode is unknown. The last message is a level setpoint, because
+        autopilots obey it for up to seconds: after that time a braking one would make the vehicle
+        fly backwards.
         """
         # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (
