@@ -23,7 +23,7 @@ import numpy as np
 
 from flock_follower.checks.findings import ERROR, Finding, first, OK, WARNING
 from flock_follower.checks.observations import Observations, Picture
-from flock_follower.perception.camera import CameraModel, marked_rectified, off_center
+from flock_follower.perception.camera import CameraModel, marked_rectified
 from flock_follower.settings import MARKER_LOST_WIDTH
 
 #: Side of a marker, px, below which its range is noisy.
@@ -68,21 +68,19 @@ def check_pictures(seen: Observations) -> Iterator[Finding]:
 def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     what, wanted = 'calibration', 'a calibration of these images'
     calibrate = 'calibrate the camera at this size (camera_calibration), give its driver the file'
+    sizes = sorted({f'{picture.width}x{picture.height}' for picture in pictures})
     try:
         camera = camera_model(seen)
     except ValueError as problem:
-        return Finding(ERROR, what, str(problem), wanted, calibrate)
+        return Finding(ERROR, what, '; '.join([str(problem), *(
+            f'images are {each}' for each in sizes[:1])]), wanted, calibrate)
     size = f'{camera.width}x{camera.height}'
-    others = sorted({f'{picture.width}x{picture.height}' for picture in pictures} - {size})
+    others = [each for each in sizes if each != size]
     measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
-    shares = camera.matrix[:2, 2] / (camera.width, camera.height)
     straight = marked_rectified(seen.names[seen.image_name])
     return first(
         what, wanted,
         (others, ERROR, f'for {size}, images are {"".join(others[:1])}', calibrate),
-        (off_center(shares) and not seen.calibration.roi.width, ERROR,
-         f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the image: K is for '
-         'another resolution', calibrate),
         (straight and np.any(camera.distortion), ERROR,
          f'{measured}, distorted, but the topic is marked as rectified',
          'start relative_pose and planner with rectified:=true'),

@@ -246,8 +246,8 @@ class Gate:
     @property
     def wind(self) -> float:
         """Return the acceleration by the wind that setpoints offset, m/s^2."""
-        offset = self._disturbance.offset(self.autopilot.needs_wind_offset)
-        return float(np.linalg.norm(offset[:2]))
+        return float(np.linalg.norm(
+            self._disturbance.offset(self.autopilot.needs_wind_offset)[:2]))
 
     @property
     def thrust_offset(self) -> float:
@@ -358,7 +358,7 @@ class Gate:
         self._height_watch.step(situation.place.height, self._commanded_height(
             setpoint, situation, now) if active and engaged else None)
         if not sends and not situation.withheld and situation.known.blind:
-            self.permit(self.permission.fall_silent(setpoint.reason))
+            self.permit(self.permission.fall_silent(setpoint.reason, report.mode_age))
         if flown.commanded:
             flown.held, flown.yaw = None, setpoint.yaw
 

@@ -111,7 +111,9 @@ class Permission:
     received: float = math.inf
     """When the newest message with the mode was received since then, s, if any."""
     obeyed: bool = False
-    """Whether the vehicle has been in the mode that obeys setpoints since then."""
+    """Whether the vehicle has been in the mode that obeys setpoints since then. While INACTIVE:
+    whether the bridge fell silent while the mode was unknown, so that a switch of the pilot may
+    have gone unseen."""
     cause: Cause | None = Cause.NOT_REQUESTED
     """The same for code; None if it is ACTIVE."""
     taker: Taker = UNKNOWN
@@ -159,7 +161,11 @@ class Permission:
         """Brake after a request for hold, land, disarm or the end of the bridge."""
         if self.phase is Phase.READY and not self.obeyed:
             return Permission(reason=why, cause=cause)
-        return self._giving_back(why, cause) if self.streams else self
+        if self.streams:
+            return self._giving_back(why, cause)
+        # A stick that moved as the bridge stopped sending counts, too.
+        return replace(self, taker=STICK) if cause is Cause.STICK and (
+            self.phase is Phase.INACTIVE and math.isfinite(self.received)) else self
 
     def _giving_back(self, why: str, cause: Cause) -> Permission:
         # Another request does not undo a takeover, or that one may have gone unseen.
@@ -168,21 +174,30 @@ class Permission:
                        cause=Cause.MODE_UNKNOWN if unseen else cause,
                        taker=STICK if cause is Cause.STICK else self.taker)
 
-    def _stop_sending(self, why: str, cause: Cause) -> Permission:
-        """Return the permission that sends nothing; a stick that was moved still counts."""
-        stopped = Permission(reason=why, cause=cause)
-        return stopped if self.taker != STICK else replace(
-            stopped, received=self.received, taker=STICK)
+    def _stop_sending(self, why: str, cause: Cause, unseen: bool = False) -> Permission:
+        """
+        Return the permission that sends nothing; a stick that was moved still counts.
+
+        :param unseen: whether the pilot may have switched unseen: the next mode shows it.
+        """
+        return Permission(reason=why, since=self.since if unseen else math.inf,
+                          received=self.received, obeyed=unseen, cause=cause, taker=self.taker)
 
     def contest(self, who: str) -> Permission:
         """Brake, because two nodes give commands at once."""
         return self if self.phase is not Phase.ACTIVE else self._giving_back(
             f'two nodes command: {who}', Cause.CONTESTED)
 
-    def fall_silent(self, why: str) -> Permission:
-        """Stop sending, as no velocity is valid: only silence starts the failsafe."""
+    def fall_silent(self, why: str, mode_age: float = 0.0) -> Permission:
+        """
+        Stop sending, as no velocity is valid: only silence starts the failsafe.
+
+        :param mode_age: time since a message last had the mode, s.
+        """
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
-        return self._stop_sending(f'fell silent: {why}', Cause.SILENT) if self.streams else self
+        unseen = self.obeyed and (mode_age > MODE_TIMEOUT or self.cause is Cause.MODE_UNKNOWN)
+        return self if not self.streams else self._stop_sending(
+            f'fell silent: {why}', Cause.SILENT, unseen)
 
     def follow_silence(self, silence: float) -> Permission:
         """Brake until offboard is requested, after a time, s, without a report of the mode."""
@@ -220,13 +235,14 @@ class Permission:
         :param airborne: whether the vehicle reports that it flies: on the ground setpoints could
             start a take-off. None: it does not report, which permits nothing.
         """
-        if not self.streams or received <= self.since:
+        if not (self.streams or self.obeyed) or received <= self.since:
             return self
         now = replace(self.follow_silence(received - self.received), received=received)
-        if now.phase is Phase.GIVING_BACK:
+        if now.phase in (Phase.GIVING_BACK, Phase.INACTIVE):
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
-            if status.armed and (now.taker == STICK or now.cause is Cause.MODE_UNKNOWN):
+            if status.armed and (now.taker == STICK or now.phase is Phase.INACTIVE or (
+                    now.cause is Cause.MODE_UNKNOWN)):
                 return now.leave_mode(status, now.taker)
             return now._stop_sending(f'given back ({now.reason})', Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):

@@ -21,6 +21,7 @@ One thread owns it, see ``setpoint_thread``; other threads may only read.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 import math
 from typing import Any, Final, NamedTuple
 
@@ -46,7 +47,7 @@ from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
-from flock_follower.mavlink.sticks import KINDS, StickWatch
+from flock_follower.mavlink.sticks import KINDS, STICK_GAP, StickWatch
 from flock_follower.mavlink.takeover import EVIDENCE_AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.messages import OdometryState, to_nanoseconds
@@ -253,8 +254,8 @@ class Bridge:
         self.housekeeping.step(now, self.alive(now))
         for change in self.housekeeping.changes():
             self.ground_station.take_warning(change)
-        self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
+        self.requests.step(self._streaming_for(now), now)
         # On a line too slow for all, setpoints go first.
         if self._reports and self.alive(now) and not self.link.transport.is_congested():
             for message in self.ground_station.due(self._boot_time(now), now):
@@ -315,7 +316,7 @@ class Bridge:
     def _end_flight(self, now: float) -> None:
         """Request the hold mode or a landing if the flight must end."""
         flies, pending, status = self.gate.flies, self.requests.pending, self.status(now)
-        handover = self.handover
+        handover, newest = self.handover, self.requests.newest
         if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
         self._forget_ended_flight(status)
@@ -324,13 +325,20 @@ class Bridge:
             self.gate.handover(now) if flies else '', now)
         if moved := self.sticks.has_moved and self.housekeeping.watches_sticks():
             end = Handover(STICK.text, cause=Cause.STICK)
+            if self.end.handover.cause is not Cause.STICK and newest is not None and (
+                    newest.own and now - newest.began <= STICK_GAP and (
+                        status.offboard or status.mode in newest.current.modes)):
+                # The stick began to move before the bridge requested that mode by itself.
+                self.end.begin()
+                flies, pending = True, None
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:
             held, *_ = handover.current.modes
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, end, held,
                             status, now)
         if ask and not self.requests.stopping:
-            stop = commands.position if moved else commands.hold
+            stop = partial(commands.position, lands=self.blind_landing is not None) if moved else (
+                commands.hold)
             self.handover = self.requests.begin(
                 stop if ask == HOLD else commands.land, now, end=self.end.handover)
             self.ground_station.take_handover(self.end.why)
@@ -362,19 +370,20 @@ class Bridge:
         """
         Send the final messages.
 
-        A vehicle that still flies our setpoints receives a hold command, or again the one by which
-        a pending request ends the flight: a landing, or the pilot's mode after a stick was moved;
-        none while its mode is unknown. The last message is a level setpoint, because autopilots
-        obey it for up to seconds: after that time a braking one would make the vehicle fly
-        backwards.
+        A vehicle that still flies our setpoints receives again the command by which a pending
+        request ends the flight, such as a landing; else the pilot's mode after a stick was moved,
+        or hold; none while its mode is unknown. The last message is a level setpoint, because
+        autopilots obey it for up to seconds: after that time a braking one would make the vehicle
+        fly backwards.
         """
         # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (
                 self.status(now) is not None):
             pending = self.requests.pending
             ends = pending is not None and pending.goal.ends_flight and pending.current.modes
+            moved = self.sticks.has_moved and self.housekeeping.watches_sticks()
             goal = pending.current if pending is not None and ends else (
-                commands.hold(self.telemetry.dialect))
+                commands.position if moved else commands.hold)(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)
         setpoint, _ = self._decide(now)
         if setpoint.kind != NONE:

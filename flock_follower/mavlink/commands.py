@@ -120,11 +120,13 @@ def hold(dialect: Dialect) -> Goal:
     return replace(goal, name='hold', reached=lambda vehicle: not vehicle.status.offboard)
 
 
-def position(dialect: Dialect) -> Goal:
-    """Return the goal of the mode that obeys the pilot's sticks, else of the hold mode."""
-    modes = dict.fromkeys(filter(None, (dialect.position, dialect.hold)))
+def position(dialect: Dialect, lands: bool = False) -> Goal:
+    """Return the goal of the mode that obeys the pilot's sticks, else of hold or landing."""
+    modes = dict.fromkeys(filter(None, (
+        dialect.position, dialect.land if lands else dialect.hold)))
     return replace(enter(dialect, *modes, ends_flight=True), name='position',
-                   reached=lambda vehicle: not vehicle.status.offboard)
+                   reached=lambda vehicle: vehicle.status.mode not in (
+                       dialect.offboard, dialect.hold, dialect.land))
 
 
 def land(dialect: Dialect) -> Goal:
@@ -183,7 +185,7 @@ class Request:
     def __init__(self, dialect: Dialect, goal: Goal, now: float, superseded: Goal | None = None,
                  own: bool = False) -> None:
         self.goal = goal
-        self.own = own
+        self.own, self.began = own, now
         self.outcome: Outcome | None = None
         self._dialect = dialect
         self._superseded = superseded

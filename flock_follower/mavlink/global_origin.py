@@ -67,13 +67,12 @@ class GlobalOrigin:
         self._link = link
         self._given = given
         self._without_gps = without_gps
-        self._time = -math.inf  # of the last message about it, s
-        self._requests = self._tries = 0
-        self._began = math.inf  # of the first step, s
+        self.begin_again()
 
     def begin_again(self) -> None:
         """Reset all, the origin too, after a reboot of the autopilot or with another autopilot."""
         self.obstacle, self.awaited = '', self._without_gps
+        # Of the last message about it, and of the first step, s.
         self._time, self._began = -math.inf, math.inf
         self._requests = self._tries = 0
         self._link.telemetry.newest.pop('GPS_GLOBAL_ORIGIN', None)

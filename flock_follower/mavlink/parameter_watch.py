@@ -53,8 +53,7 @@ class ParameterWatch:
         for name in names:
             if name not in values:
                 continue
-            before, value = self._flown.setdefault(name, values[name]), values[name]
-            change = before, value
+            change = before, value = self._flown.setdefault(name, values[name]), values[name]
             if value == before:
                 self._changes.pop(name, None)
             elif self._changes.get(name) != change:

@@ -244,6 +244,6 @@ class Requests:
         if name and not height >= values.get(name, math.inf) - TOLERANCE:
             return (f'{name} = {values.get(name, "unknown")} m: '
                     f'it would climb that high, above takeoff_height = {height:g} m')
-        reached = envelope.Location(height + (self._gate.heights.height(now) or 0.0))
-        beyond = envelope.find_exceeded_bound(limits, reached, 0.0)
+        beyond = envelope.find_exceeded_bound(
+            limits, envelope.Location(height + (self._gate.heights.height(now) or 0.0)), 0.0)
         return beyond and f'it would end at {beyond}'

@@ -267,7 +267,8 @@ class TwistFrame:
         and in the two readings.
         """
         self._before = ''  # the frame found before the velocity was dropped
-        self._failing = self._moving = 0
+        self.failing = self._moving = 0
+        """The newest windows in a row that the frame in use does not fit."""
         self._agreeing = 0  # windows in a row, since it was dropped
         self._evidence = 0.0  # for 'child', against 'odom'
         self.restart()
@@ -281,7 +282,7 @@ class TwistFrame:
         """Return the frame to use for a velocity, given its value in both frames (3,), m/s."""
         if self.wanted != AUTO or self.found:
             return self.frame
-        if self._failing or self.contradiction or not child.any():
+        if self.failing or self.contradiction or not child.any():
             return NONE
         differ = float(np.abs(child - odom).max()) > SAME_VELOCITY
         if abs(self._evidence) < LIKELY_EVIDENCE and differ:
@@ -357,8 +358,8 @@ class TwistFrame:
             self._recover(fitting, speed > tolerance)
             return
         fits = self.found in fitting if self.found else bool(fitting)
-        self._failing = 0 if fits else self._failing + 1
-        if self._failing >= AGREEING_WINDOWS:
+        self.failing = 0 if fits else self.failing + 1
+        if self.failing >= AGREEING_WINDOWS:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
             self._before, self._agreeing, self._moving = self.found, 0, 0
             self.found, self.contradiction = NONE, float(off[used])
@@ -376,6 +377,6 @@ class TwistFrame:
         self._moving = self._moving + moving if fitting else 0
         known = self._before in fitting
         if self._moving >= AGREEING_WINDOWS or (known and self._agreeing >= EXPIRES):
-            self.found, self._failing = self._before if known else '', 0
+            self.found, self.failing = self._before if known else '', 0
             if not known:
                 self._evidence = 0.0  # another frame, or none was known: it is sought anew

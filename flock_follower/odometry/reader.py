@@ -48,6 +48,7 @@ from flock_follower.geometry import (
     unit_quaternion_to_matrix,
 )
 from flock_follower.messages import (
+    FASTEST_OWN,
     MAX_JUMP,
     NANOSECONDS,
     ODOMETRY_STD,
@@ -284,9 +285,12 @@ class OdometrySource:
             self._doubt = child - odom
             velocity = self._as_read(self._reading, time, child, odom)
             if self._gaps and before != self._reading:
-                # The step that another reading would be is faded out.
+                # The step that another reading would be is faded out; not a velocity that the
+                # positions contradict.
                 left = np.zeros(3) if self._fading is None else self._fading
-                self._fading = (left + self._as_read(before, time, child, odom)) - velocity
+                self._fading = None if self._reading == NONE and (
+                    self.twist.failing or self.twist.contradiction) else (
+                        left + self._as_read(before, time, child, odom)) - velocity
         if self._fading is not None and self._fading.any():
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading
@@ -423,8 +427,9 @@ def _vector(message: Any) -> tuple[Array, bool]:
 
 
 def _twist(message: Any) -> tuple[Array | None, Array]:
-    """Return the velocity (3,), None if invalid, and the rates (3,), zeros if invalid."""
+    """Return the velocity (3,), None if invalid or too fast, and the rates, zeros if invalid."""
     twist = message.twist.twist
     (linear, moving), (rates, turning) = _vector(twist.linear), _vector(twist.angular)
     known = not message.twist.covariance[0] >= INVALID_VARIANCE  # NaN is not known to be large
-    return linear if known and moving else None, rates if turning else np.zeros(3)
+    return linear if known and moving and math.hypot(*linear.tolist()) <= FASTEST_OWN else None, (
+        rates if turning else np.zeros(3))

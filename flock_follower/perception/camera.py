@@ -144,13 +144,23 @@ class CameraModel:
         """
         Return the camera of a ``CameraInfo`` message, of its region of interest and binning.
 
+        K and size are those of the full image, whose optical axis is near its middle. A K for an
+        image of 0.7 to 1.3 times the size keeps the axis there: that cannot be known.
+
         :raises ValueError: naming the fault of the calibration.
         """
-        return cls.from_calibration(
+        camera = cls.from_calibration(
             info.k, info.d, info.distortion_model, info.width, info.height, info.p,
-            rectified=rectified).scaled(
-                info.roi.x_offset, info.roi.y_offset, info.roi.width or info.width,
-                info.roi.height or info.height, max(info.binning_x, 1), max(info.binning_y, 1))
+            rectified=rectified)
+        shares = camera.matrix[:2, 2] / (info.width, info.height)
+        if off_center(shares):
+            raise ValueError(
+                f'optical axis at {shares[0]:.0%}, {shares[1]:.0%} of {info.width}x{info.height} '
+                '(K, width and height of the full image, or of the image sent without roi and '
+                'binning): K is for another image')
+        return camera.scaled(
+            info.roi.x_offset, info.roi.y_offset, info.roi.width or info.width,
+            info.roi.height or info.height, max(info.binning_x, 1), max(info.binning_y, 1))
 
     def scaled(self, x_offset: int, y_offset: int, width: int, height: int,
                binning_x: int = 1, binning_y: int = 1) -> CameraModel:
@@ -167,14 +177,6 @@ class CameraModel:
             raise ValueError(
                 f'roi = {width}x{height}+{x_offset}+{y_offset}, binning {binning_x}x{binning_y}: '
                 f'must lie inside {self.width}x{self.height}')
-        binning, size = np.array([binning_x, binning_y]), np.array([self.width, self.height])
-        shares = self.matrix[:2, 2] / size
-        if (max(binning_x, binning_y) > 1 and (width, height) == (self.width, self.height)
-                and off_center(shares) and not off_center(shares * binning)):
-            raise ValueError(
-                f'binning {binning_x}x{binning_y}, optical axis at {shares[0]:.0%}, '
-                f'{shares[1]:.0%} of the image: K is binned already; camera_info must have K, '
-                'width and height of the full image, or those of the binned one and binning 0')
         # A binned pixel's center lies half a binned pixel from its edge: shift, scale, shift.
         matrix = self.matrix.copy()
         matrix[:2, 2] += 0.5 - np.array([x_offset, y_offset])

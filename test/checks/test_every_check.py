@@ -257,6 +257,10 @@ FAULTS: list[Fault] = [
           change(gaps=[(0.0, 7e9, False)])),
     Fault('a calibration of another size', BOTH, ERROR, 'calibration',
           'for 1280x720, images are 640x480', 'calibrate the camera at this size',
+          change(lambda seen: seen.calibration, width=1280, height=720, k=[
+              2.0 * FOCAL, 0.0, 640.0, 0.0, 2.0 * FOCAL, 360.0, 0.0, 0.0, 1.0])),
+    Fault('a size of other images', BOTH, ERROR, 'calibration',
+          'K is for another image; images are 640x480', 'calibrate the camera at this size',
           change(lambda seen: seen.calibration, width=1280, height=720)),
     Fault('a matrix for images of twice the size', BOTH, ERROR, 'calibration',
           'optical axis at 100%', 'calibrate the camera',

@@ -313,3 +313,10 @@ def test_command_is_accepted_only_while_active():
     assert gate.decide(10.06)[0].kind == 'brake'
     gate.decide(13.0)  # without any velocity since
     assert gate.permission.reason == 'fell silent: velocity from odom stale'
+
+
+def test_a_silence_without_the_mode_hides_no_takeover():
+    gate = fresh_gate()
+    assert decide(gate, 13.2, link_age=3.2, mode_age=3.2).kind == 'none'
+    gate.take_status(NOT_FLOWN, 14.0)
+    assert gate.permission.taken_over(23.9)

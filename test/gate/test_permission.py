@@ -122,6 +122,35 @@ def test_nothing_but_a_request_undoes_a_moved_stick(events):
     assert not next_permission(permission, ('request', 15.0)).taken_over(15.0)
 
 
+@pytest.mark.parametrize('ended', [
+    (('fall_silent', 'no velocity'),), (ENDED, seen(HOLD, 5.0))])
+def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
+    permission = after(ASKED, seen(OURS, 5.0), *ended, MOVED)
+    assert permission.phase is Phase.INACTIVE
+    assert permission.taken_over(14.9).startswith('the pilot took over')
+    assert not permission.taken_over(15.0) and after(MOVED) == Permission()
+
+
+UNSEEN = ('fall_silent', 'no velocity', 3.1)  # without a mode for so long, s
+
+
+@pytest.mark.parametrize('events', [
+    (UNSEEN,), (('follow_silence', 5.1), ('fall_silent', 'no velocity')), (UNSEEN, ENDED)])
+def test_silence_hides_no_switch_that_was_not_seen(events):
+    silent = after(ASKED, seen(OURS), *events)
+    assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
+    assert next_permission(silent, seen(OURS, 20.0)).phase is Phase.INACTIVE
+    switched = after(ASKED, seen(OURS), *events, seen(OURS, 20.0), seen(PILOT, 21.0))
+    assert switched.phase is Phase.TAKEN_OVER and switched.taken_over(30.9)
+    landed = next_permission(silent, seen(DISARMED, 20.0))
+    assert not landed.taken_over(20.0)
+    assert next_permission(landed, seen(PILOT, 21.0)) is landed
+    # Nothing is hidden if the mode was known, or had not been there yet.
+    for known in (after(ASKED, seen(OURS), ('fall_silent', 'no velocity', 3.0)),
+                  after(ASKED, UNSEEN)):
+        assert next_permission(known, seen(PILOT, 20.0)) is known
+
+
 def test_a_request_hides_no_possible_takeover_by_the_pilot():
     lost = after(ASKED, seen(OURS), ('follow_silence', 5.1), ENDED)
     assert lost.announcement() == 'READY: giving back: hold requested'
@@ -208,7 +237,7 @@ def test_long_silence_may_hide_a_takeover_and_return():
 
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [('request', 1.0), ('follow_silence', 5.1), ('fall_silent', 'no velocity'),
+EVENTS = [('request', 1.0), ('follow_silence', 5.1), ('fall_silent', 'no velocity'), UNSEEN,
           ('fail', 'late'), LANDED, ENDED, MOVED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]

@@ -264,3 +264,65 @@ def test_the_end_of_the_bridge_does_not_undo_a_moved_stick():
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(1.0)
     assert flight.mode == 'POSCTL'
+
+
+def ends_by_itself(how):
+    """Return a flight on 1.18 that the bridge is about to end by itself, and when, s."""
+    flight = Flight()
+    flight.controller._sticks = True
+    flight.fly(0.5)
+    flight.wire.arrived += flight.autopilot._packed([version(1, 18)])
+    flight.follow(1.0)
+    flight.wire.arrived += flight.autopilot._packed([manual_control(REST)])
+    flight.fly(0.05)
+    if how == 'land':
+        flight.odom_error[0] = 3.0  # contradicted: neither velocity is used
+        return flight, flight.now + 0.8
+    flight.planner = None
+    return flight, flight.now + 2.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('how', ['land', 'hold'])
+@pytest.mark.parametrize('early', [0.25, 0.15, 0.05, -0.05, -0.5])
+def test_a_stick_that_crosses_the_end_by_the_bridge_counts(how, early):
+    flight, ends = ends_by_itself(how)
+    flight.fly(ends - early - flight.now)
+    for roll in [0.8] * 4 + [0.0] * 10:
+        flight.wire.arrived += flight.autopilot._packed([
+            manual_control(REST._replace(roll=roll))])
+        flight.fly(1.0 / RATE)
+    assert flight.mode == 'POSCTL'
+    assert 'the pilot took over' in flight.ask('offboard', True).message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('how', ['land', 'hold'])
+def test_a_stick_moved_later_undoes_no_switch_to_hold(how):
+    """The pilot switches away, flies by stick, and switches to the mode of the bridge."""
+    flight, ends = ends_by_itself(how)
+    flight.fly(ends + 0.5 - flight.now)
+    assert flight.mode == (flight.modes.hold if how == 'hold' else flight.modes.land)
+    flight.fly(1.0)
+    for mode in ('POSCTL', flight.modes.hold, flight.modes.land):
+        flight.controller.pilot_switches(mode)
+        for _ in range(5):
+            flight.wire.arrived += flight.autopilot._packed([
+                manual_control(REST._replace(roll=0.8))])
+            flight.fly(1.0 / RATE)
+        assert flight.mode == mode
+
+
+@pytest.mark.slow
+def test_a_stick_that_moves_while_the_bridge_stops_counts():
+    flight, _ = ends_by_itself('hold')
+    flight.bridge.stop(flight.now)
+    for _ in range(2):
+        flight.wire.arrived += flight.autopilot._packed([
+            manual_control(REST._replace(roll=0.8))])
+        flight.fly(1.0 / RATE)
+    assert flight.mode == 'OFFBOARD'  # nothing more is requested before the end
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(0.1)
+    assert flight.mode == 'POSCTL'

@@ -252,6 +252,9 @@ def test_a_wrong_marker_is_named_beside_the_wanted_one(
     ('image = 640x240: camera_info is for 640x480', {'height': 240}, {'invalid image': 1}),
     ('K = 0: the camera is not calibrated', {'k': np.zeros(9)},
      {'invalid camera_info': 1, 'no usable camera_info': 1}),
+    ('K is for another image', {'k': np.array([
+        1200.0, 0.0, 640.0, 0.0, 1200.0, 480.0, 0.0, 0.0, 1.0])},
+     {'invalid camera_info': 1, 'no usable camera_info': 1}),
     ('roi = 640x480+600+0', {'roi': RegionOfInterest(x_offset=600, width=640, height=480)},
      {'invalid camera_info': 1, 'no usable camera_info': 1})])
 def test_what_is_corrupt_is_dropped_counted_and_explained(

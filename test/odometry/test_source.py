@@ -187,6 +187,20 @@ def test_contradicted_velocity_is_dropped_and_trusted_again() -> None:
     assert max(off[1000:]) < 0.06  # what the derivation trembles
 
 
+@pytest.mark.parametrize('begin', [0.0, 5.0])
+@pytest.mark.parametrize('wrong', [0.8, 8.0, 99.0, 1e5])
+def test_no_part_of_a_contradicted_velocity_is_used(wrong: float, begin: float) -> None:
+    source = OdometrySource()
+    for k in range(700):
+        t = 0.01 * k
+        state = taken(source, odometry(
+            empty, START + round(t * 1e9), 'odom', 'base_link', [0.5 * t, 0.0, 1.0],
+            [0.0, 0.0, 0.0, 1.0], [0.5 + (wrong if t >= begin else 0.0), 0.0, 0.0]), t)
+        # A velocity that no vehicle has is refused at once, another one by the positions.
+        known = t > 0.2 if wrong > 100.0 else not begin <= t < begin + 1.1
+        assert not known or abs(state.velocity[0] - 0.5) < 0.05
+
+
 def test_what_a_source_leaves_out_is_told() -> None:
     source = OdometrySource(SourceParams(std=(0.2, 0.1, 0.3, 0.4)))
     (_, state), *_ = read(source, Source(rates=False, covariances=False), 0.01)

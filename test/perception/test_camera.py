@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -98,11 +99,45 @@ def test_thin_prism_and_tilted_sensor_agree_with_opencv(count: int) -> None:
     np.testing.assert_allclose(camera.linearize(points)[1], differences, rtol=1e-5, atol=1e-3)
 
 
-def test_a_matrix_that_is_binned_already_is_refused() -> None:
-    half = make_camera(width=640, height=480).scaled(0, 0, 640, 480, 2, 2).matrix
-    full = CameraModel(half, [], 'plumb_bob', 640, 480)
-    with pytest.raises(ValueError, match='binned already'):
-        full.scaled(0, 0, 640, 480, 2, 2)
+def info(scale: float = 1.0, shift: tuple[float, float] = (0.0, 0.0),
+         size: tuple[int, int] = (640, 480),
+         roi: tuple[int, int, int, int] = (0, 0, 0, 0), binning: int = 0) -> Any:
+    """Return a CameraInfo with K scaled, then shifted by px, and what else it claims."""
+    matrix = np.diag([scale, scale, 1.0]) @ K
+    matrix[:2, 2] -= shift
+    x, y, width, height = roi
+    return SimpleNamespace(
+        k=matrix.ravel(), d=[], distortion_model='plumb_bob', width=size[0], height=size[1],
+        p=np.column_stack([matrix, np.zeros(3)]).ravel(),
+        roi=SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height),
+        binning_x=binning, binning_y=binning)
+
+
+@pytest.mark.parametrize(('claims', 'sees'), [
+    ({}, (640, 480)),
+    ({'binning': 2}, (320, 240)),
+    ({'roi': (160, 120, 320, 240)}, (320, 240)),
+    ({'roi': (0, 0, 320, 240), 'binning': 2}, (160, 120)),
+    ({'scale': 0.5, 'size': (320, 240)}, (320, 240)),
+    ({'scale': 2.0, 'size': (1280, 960), 'roi': (700, 500, 400, 400)}, (400, 400)),
+    ({'shift': (-60.0, 40.0)}, (640, 480))])
+def test_what_camera_info_says_of_the_image_is_used(
+        claims: dict[str, Any], sees: tuple[int, int]) -> None:
+    camera = CameraModel.from_info(info(**claims))
+    assert (camera.width, camera.height) == sees
+
+
+@pytest.mark.parametrize('rectified', [False, True])
+@pytest.mark.parametrize('claims', [
+    {'scale': 2.0}, {'scale': 0.5}, {'scale': 1.5}, {'scale': 2.0 / 3.0},
+    {'scale': 0.5, 'binning': 2},  # K is binned already
+    {'size': (320, 240), 'binning': 2},  # only the size is binned
+    {'size': (320, 240)},  # a region, or a smaller image, without its roi or binning
+    {'shift': (160.0, 120.0), 'roi': (160, 120, 320, 240)},  # K is that of the region
+    {'shift': (160.0, 120.0)}])
+def test_a_matrix_for_another_image_is_refused(claims: dict[str, Any], rectified: bool) -> None:
+    with pytest.raises(ValueError, match='K is for another image'):
+        CameraModel.from_info(info(**claims), rectified)
 
 
 def test_rectified_image_uses_p_without_distortion() -> None:
