@@ -83,7 +83,7 @@ def judge(bag: Path, dictionary: str, images: int = 0) -> dict[str, dict[str, fl
                 count += 1
                 true = (own @ T_BODY_OPTICAL).inverse() @ other
                 measured: dict[str, tuple[Transform, Array] | None] = {
-                    OURS: seen.sighting.poses.get(LEADER)}
+                    OURS: seen.sighting.poses.get(LEADER, lambda: None)()}
                 for name, look in looks.items():
                     marker = look(seen.pixels)
                     measured[name] = None if marker is None else (

@@ -25,7 +25,7 @@ rates.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
@@ -42,7 +42,7 @@ from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
-from flock_follower.perception.pose import contradicts, locate, MAX_TURN, Target
+from flock_follower.perception.pose import locate_by_edges, MAX_TURN, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.square_pose import refine
 from flock_follower.perception.time_offset import MountedCamera
@@ -139,15 +139,17 @@ class MeasuredPose(NamedTuple):
     covariance: Array
 
     @classmethod
-    def of(cls, measurement: Measurement, T_camera_body: Transform, scales: tuple[float, float],
-           direction_noise: float, distance_noise: float) -> MeasuredPose:
+    def of(cls, measurement: Measurement, T_smooth_camera: Transform, T_smooth_body: Transform,
+           scales: tuple[float, float], direction_noise: float,
+           distance_noise: float) -> MeasuredPose:
         """
         Return the pose of a measurement.
 
-        :param T_camera_body: its pose, straightened.
+        :param T_smooth_body: its pose, straightened.
         :param scales: factors on its deviations of position and attitude.
         :param direction_noise: of the line of sight, rad; :param distance_noise: a share of it.
         """
+        T_camera_body = T_smooth_camera.inverse() @ T_smooth_body
         scale = np.repeat(scales, 3)
         covariance = measurement.covariance * np.outer(scale, scale)
         sight = T_camera_body.apply(measurement.reference)
@@ -207,7 +209,7 @@ class Sighting:
     The result of one image.
 
     ``estimates`` and ``measurements`` by neighbor's name, of the neighbors measured in this
-    image; ``poses`` are the measured ones, except those whose attitude was not plausible;
+    image; ``poses`` return the measured ones, except those whose attitude was not plausible;
     ``stage`` is the costliest stage of detection that was used, 'none' if the image could
     not be used or no neighbor was to be detected in it. ``rejections`` are (reason, detail), one
     for each thing dropped; ``other_ids`` are the ids of markers of no neighbor. ``duplicates``,
@@ -223,7 +225,7 @@ class Sighting:
     other_ids: list[int] = field(default_factory=list)
     duplicates: dict[str, Estimate] = field(default_factory=dict)
     misprints: dict[str, Fault] = field(default_factory=dict)
-    poses: dict[str, MeasuredPose] = field(default_factory=dict)
+    poses: dict[str, Callable[[], MeasuredPose]] = field(default_factory=dict)
 
     @property
     def stages(self) -> dict[str, str]:
@@ -266,19 +268,16 @@ class Look:
         """Return a measurement of a neighbor, or the fault of its detected marker."""
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
-            recent = self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD
-            if recent or found.margin is not None:  # both would take too long for one image
+            if self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD:
                 return found
-            place, prior = found.T_camera_body, PosePrior(None, self.expected[name].up)
+            place = found.T_camera_body
             ids, corners = search.near(
                 image, self.model, dictionary, sought.neighbor, place, False)
             for index, marker in enumerate(sought.neighbor.markers):
                 middle = place.apply(marker.T_body_marker.translation)
                 for outline in corners[ids == marker.marker_id]:
-                    if not contradicts(
-                            image, self.model, sought, index, outline, place, prior.up):
-                        continue
-                    again = locate(image, self.model, sought, index, outline, prior, False)
+                    again = locate_by_edges(
+                        image, self.model, sought, index, outline, self.expected[name].up)
                     if again is not None and angle(again.T_camera_body, place) > MAX_TURN and (
                             math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),
                                       middle) < marker.side_length):

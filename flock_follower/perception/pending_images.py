@@ -278,7 +278,7 @@ class Perceiver:
         frame = self._cameras[image.camera].frame if header is None else header.frame_id
         for name, measured in seen.sighting.poses.items():
             if wanted(topic := pose_topic(name)):
-                yield topic, pose_with_covariance(make, image.stamp_ns, frame, *measured)
+                yield topic, pose_with_covariance(make, image.stamp_ns, frame, *measured())
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return the seconds since the first stamp: small floats resolve a nanosecond."""

@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -228,7 +229,7 @@ def quadrilaterals(logarithm: GrayImage,
                    windows: Sequence[tuple[int, int]] = _SEARCH_WINDOWS) -> Array:
     """Return the quadrilaterals, (n, 4, 2), px, clockwise, that may be the outlines of markers."""
     smooth = cv2.blur(logarithm, (3, 3))
-    found = []
+    outlines, areas = [], []
     for window, brush in windows:
         dark = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C,
                                      cv2.THRESH_BINARY_INV, window, _MIN_DARKNESS)
@@ -245,35 +246,63 @@ def quadrilaterals(logarithm: GrayImage,
             length, area = cv2.arcLength(hull, True), cv2.contourArea(hull)
             if _MIN_OUTLINE < length < math.sqrt(_MAX_ELONGATION * area):
                 outline = cv2.approxPolyDP(hull, _STRAIGHT_SHARE * length, True)
-                if len(outline) > _MAX_CORNERS:
-                    continue
-                found += _squares(outline[:, 0].tolist(), _MAX_HIDDEN_SHARE * area)
-    return np.reshape(found, (-1, 4, 2)).astype(float)
+                if 4 <= len(outline) <= _MAX_CORNERS:
+                    outlines.append(outline[:, 0])
+                    areas.append(area)
+    return _squares(outlines, _MAX_HIDDEN_SHARE * np.array(areas))
 
 
-def _squares(corners: list[list[float]], max_hidden: float) -> list[list[list[float]]]:
+def _squares(outlines: list[Array], max_hidden: Array) -> Array:
     """
-    Return the quadrilaterals that convex corners (n, 2), clockwise, may be the visible part of.
+    Return the quadrilaterals that convex outlines may be the visible parts of, (n, 4, 2).
 
     One side of five is where a reflex ends. Before, sides that hide next to nothing are removed,
-    and of more than five those that hide least.
+    and of more than five those that hide least, of equals the one that hides most to the left.
 
-    :param max_hidden: the largest area that may be hidden, px^2.
+    :param outlines: corners (4 to _MAX_CORNERS, 2) of each, clockwise.
+    :param max_hidden: the largest area that may be hidden of each, px^2.
     """
-    count = len(corners)
-    if count <= 4:
-        return [corners] if count == 4 else []
-    fewer = []
-    for k in range(count):
-        (ax, ay), (bx, by), (cx, cy), (dx, dy) = (corners[(k + i) % count] for i in range(4))
-        across = (bx - ax) * (dy - cy) - (by - ay) * (dx - cx)
-        if across > 1e-9:  # the sides before and after meet beyond this one
-            further = ((cx - bx) * (dy - cy) - (cy - by) * (dx - cx)) / across
-            hidden = 0.5 * further * ((bx - ax) * (cy - by) - (by - ay) * (cx - bx))
-            if hidden < max_hidden:
-                met = [bx + further * (bx - ax), by + further * (by - ay)]
-                fewer.append((hidden, [met, *(corners[(k + i) % count]
-                                              for i in range(3, count + 1))]))
-    if fewer and (count > 5 or min(fewer)[0] < _BLUNT_SHARE * max_hidden):
-        return _squares(min(fewer)[1], max_hidden)
-    return [square for _, square in fewer] if count == 5 else []
+    counts = np.array([len(outline) for outline in outlines])
+    index, corners = np.zeros(0, dtype=np.intp), np.zeros((0, _MAX_CORNERS, 2))
+    several: list[tuple[Any, Array]] = []  # quadrilaterals of which one side of five is removed
+    for count in range(_MAX_CORNERS, 4, -1):
+        with_count = (counts == count).nonzero()[0]
+        index = np.concatenate([index, with_count])
+        corners = np.concatenate([corners, np.reshape(
+            [outlines[k] for k in with_count.tolist()], (-1, count, 2))])
+        fewer, hidden = _without_sides(corners)
+        hidden = np.where(hidden < max_hidden[index, None], hidden, np.inf)
+        least = np.where(hidden == hidden.min(axis=1, keepdims=True),
+                         fewer[:, :, 0].dot((1.0, 1e-6)), np.inf).argmin(axis=1)
+        rows = np.arange(len(index))
+        removed = hidden[rows, least] < (
+            np.inf if count > 5 else _BLUNT_SHARE * max_hidden[index])
+        if count == 5:
+            row, side = ((hidden < np.inf) & ~removed[:, None]).nonzero()
+            several.append((index[row], fewer[row, side]))
+        index, corners = index[removed], fewer[rows, least][removed]
+    whole = (counts == 4).nonzero()[0]
+    several += [(index, corners), (whole, np.reshape(
+        [outlines[k] for k in whole.tolist()], (-1, 4, 2)))]
+    order = np.argsort(np.concatenate([each for each, _ in several]), kind='stable')
+    squares: Array = np.concatenate([each for _, each in several])[order]
+    return squares
+
+
+def _without_sides(corners: Array) -> tuple[Array, Array]:
+    """
+    Return convex outlines (n, c, 2) with each side removed, (n, c, c - 1, 2), and what it hid.
+
+    The sides before and after are prolonged until they meet. What is hidden, (n, c), px^2, is
+    infinite if they do not meet.
+    """
+    count = corners.shape[1]
+    a, b, c, d = (np.roll(corners, -k, axis=1) for k in range(4))
+    (ax, ay), (bx, by), (cx, cy) = (np.moveaxis(leg, 2, 0) for leg in (b - a, c - b, d - c))
+    across = ax * cy - ay * cx
+    meet = across > 1e-9
+    further = (bx * cy - by * cx) / np.where(meet, across, 1.0)
+    hidden = np.where(meet, 0.5 * further * (ax * by - ay * bx), np.inf)
+    met = b + further[:, :, None] * (b - a)
+    others = (np.arange(count)[:, None] + np.arange(3, count + 1)) % count
+    return np.concatenate([met[:, :, None], corners[:, others]], axis=2), hidden

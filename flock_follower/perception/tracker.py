@@ -29,6 +29,7 @@ Once a second the whole image is searched even if none is missing: see ``hypothe
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -227,9 +228,10 @@ class Tracker:
         model.check_image(image.shape[1], image.shape[0])
         look.sighting.stage = 'track'
         for name in look.near:
+            checked = look.camera.unchecked[name] == 0
             self._measure(image, look, name, track(
                 image, model, self._targets[name], look.expected[name],
-                look.camera.measured.get(name), look.camera.unchecked[name] == 0))
+                look.camera.measured.get(name), checked), checked)
         for name, expected in self._candidates(look):
             found = track(image, model, self._targets[name], expected, None, True)
             if found is not None and not look.known(found, self._side[name]):
@@ -316,23 +318,28 @@ class Tracker:
         """Return the time of a neighbor's filter, s, of an exposure by the camera's clock, s."""
         return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
 
-    def _measure(self, image: GrayImage, look: Look, name: str,
-                 found: Measurement | None) -> None:
-        """Take the measurement of a neighbor near its expected place, if it was found there."""
+    def _measure(self, image: GrayImage, look: Look, name: str, found: Measurement | None,
+                 checked: bool) -> None:
+        """
+        Take the measurement of a neighbor near its expected place, if it was found there.
+
+        :param checked: whether the mirrored attitude was fitted, or too many steps were needed.
+        """
         if found is None:
             return
         if self._of_candidate(look, found):
             look.others.append(found)
             return
-        found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
+        if not checked or found.spacing is not None:  # both would take too long for one image
+            found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
         unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
         if found.margin is not None:
             unchecked[name] = self._images_unchecked(found, look.expected[name])
         elif found.spacing is None and last is not None and last.spacing is not None:
             unchecked[name] = 0  # its edges decided until now
-        elif unchecked[name]:
-            unchecked[name] -= 1
+        else:  # after a check that failed, one image has time for a confirmation
+            unchecked[name] = int(checked) or unchecked[name] - 1
 
     def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
         """Return the number of images until the mirrored attitude is checked again."""
@@ -473,8 +480,8 @@ class Tracker:
         sighting.measurements[name] = measurement
         sighting.estimates[name] = self._estimate(self._filters[name], look, placed)
         if outcome is not UpdateOutcome.POSITION_ONLY and name in self._marked:
-            sighting.poses[name] = MeasuredPose.of(
-                measurement, placed.view.T_smooth_camera.inverse() @ placed.T_smooth_body,
+            sighting.poses[name] = partial(  # few need it
+                MeasuredPose.of, measurement, placed.view.T_smooth_camera, placed.T_smooth_body,
                 camera.noise.scales, DIRECTION_ERROR / float(look.model.matrix[0, 0]),
                 camera.noise.distance)
 

@@ -93,7 +93,8 @@ def figures_of(name: str) -> dict[str, float]:
         electrons = 1e4 * np.clip(1.5 * light, 0.0, 1.0)
         electrons += np.sqrt(electrons + 64.0) * noise.standard_normal(light.shape)
         image = np.rint(255.0 * np.clip(1e-4 * electrons, 0.0, 1.0)**(1.0 / 2.2)).astype(np.uint8)
-        for measured in tracker.process_image(stamp, image, camera).poses.values():
+        for pose in tracker.process_image(stamp, image, camera).poses.values():
+            measured = pose()
             errors.append(judged.errors_of(
                 *measured, (me @ MOUNTING).inverse() @ other))
     figures: dict[str, float] = judged.summary(errors)
