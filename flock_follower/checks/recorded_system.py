@@ -128,8 +128,8 @@ class RecordedSystem:
         """
         Take a message; ignore messages of other topics, and messages after the checked time.
 
-        Return the fields of the message if they were read. If the bytes are no message of the type,
-        the bag is reported as incomplete.
+        Return the fields of the message if they were read. If the bytes are no message of the
+        type, the bag is reported as incomplete.
 
         :param message: the fields, if they were read before.
         """

@@ -15,8 +15,9 @@
 """
 The situation of one decision: all inputs of ``setpoint_rules.decide`` as one value.
 
-The gate collects its inputs into a ``Situation``, and ``decide`` turns it into a setpoint.
-``to_json`` writes it as one line, ``from_json`` reads it: a decision can be made again.
+The gate collects its inputs in a ``Situation``; ``decide`` returns the setpoint for it.
+``to_json`` writes a situation as one line, ``from_json`` reads the line, so a decision can be
+repeated.
 """
 
 from __future__ import annotations
@@ -101,12 +102,12 @@ class Situation:
 
     @property
     def command_age(self) -> float:
-        """Return the time since the command applied, s; infinite without one."""
+        """Return the time since the command became valid, s; infinite without a command."""
         return math.inf if self.command is None else self.now - self.command.time
 
     @property
     def source_age(self) -> float:
-        """Return the age of the image that the command rests on, s; infinite without one."""
+        """Return the age of the image on which the command is based, s; infinite without one."""
         return math.inf if self.command is None else self.now - self.command.source_time
 
     def to_json(self) -> str:
@@ -115,7 +116,7 @@ class Situation:
 
     @classmethod
     def from_json(cls, line: str) -> Situation:
-        """Return the situation of a line of ``to_json``; equal bit for bit, arrays as arrays."""
+        """Return the situation in a line of ``to_json``, equal bit for bit."""
         situation: Situation = _read_value(cls, json.loads(line))
         return situation
 
