@@ -25,9 +25,9 @@ An agent i at x_i with velocity v_i accelerates with (eqs. 4 and 5 of the paper)
     f0(r^2) = 1 / (r^2 - d0)^theta   f1(r^2) = 1 / (d1 - r^2)^theta
     L^2 = (1/k) sum_{i>j} |v_i - v_j|^2 = sum_i |v_i - mean(v)|^2
 
-The law keeps ``d0 < r^2 < d1``: d0 and d1 bound the *squared* distance. The paper prints
-f1 = 1 / (r^2 - d1)^theta, which is equal for even theta only: for odd theta this f1 repels, and
-for a theta that is not an integer it is not a real number. The paper's alpha appears in no formula.
+The law keeps ``d0 < r^2 < d1``: d0 and d1 bound the *squared* distance. The paper prints f1 = 1 /
+(r^2 - d1)^theta, which is equal for even theta only: for odd theta this f1 repels, and for a theta
+that is not an integer it is not a real number. The paper's alpha appears in no formula.
 
 The paper's law has no value outside the band. Here the gaps r^2 - d0 and d1 - r^2 are at least
 1e-6 m^2, so below d0 the force always repels, and beyond d1 it always attracts, strongly but

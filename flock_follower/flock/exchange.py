@@ -314,7 +314,7 @@ class Sharing:
     # Out.
 
     def messages(self, now: int) -> list[OdometryState]:
-        """Return the messages to send: the ego state and sightings, each once, at most 10 Hz."""
+        """Return the messages to send: ego state and sightings, each once, at 10 Hz at most."""
         own, name = self._own, self.name
         if own is None or now - own.stamp > STALE_AGE or (
                 self._last_round is not None and 0 <= now - self._last_round < PERIOD):

@@ -92,8 +92,8 @@ class DisturbanceObserver:
         """
         Update the estimate to ``now``, s.
 
-        :param sent: acceleration (3,), m/s^2, flown since the last step; None if the vehicle did not
-            fly our setpoints: this resets the estimate.
+        :param sent: acceleration (3,), m/s^2, flown since the last step; None if the vehicle did
+            not fly our setpoints: this resets the estimate.
         :param velocity: measured (3,), m/s; None if unknown: the estimate does not change.
         """
         elapsed, self._time = now - self._time, now
@@ -134,7 +134,7 @@ HEIGHT_LEFT: Final[float] = 0.2
 
 
 class HeightWatch:
-    """Detects a height that departs from the commanded height: an unestimated thrust error."""
+    """Detects that the height departs from the commanded height, by an unknown thrust error."""
 
     def __init__(self) -> None:
         self.reason = ''

@@ -420,7 +420,7 @@ class Source:
                 self.yaws.popleft()
 
     def yaw(self, time: float = math.inf) -> tuple[float, float]:
-        """Return the yaw nearest to a time, s, in rad, and its own time; by default the newest."""
+        """Return the yaw, rad, nearest to a time, s, and its own time; by default the newest."""
         newest_time, newest = self.yaws[-1] if self.yaws else (-math.inf, 0.0)
         if not newest_time > time:
             return newest, newest_time
