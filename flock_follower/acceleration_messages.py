@@ -32,8 +32,8 @@ def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
     """
     Return an AccelWithCovarianceStamped of a neighbor, in its own frame ``child``.
 
-    ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). Its angular part is not known:
-    its covariance is -1.
+    ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). The angular acceleration is
+    unknown: its covariance is -1.
     """
     message = make(ACCELERATION)
     set_stamp(message.header.stamp, stamp)

@@ -24,9 +24,10 @@ state and, after a colon, the reason::
     ACTIVE
     TAKEN_OVER: offboard was left for POSCTL
 
-The bridge sends it at each change, and at 2 Hz: otherwise ``ACTIVE`` of a dead bridge would stay
-on the latched topic. Its diagnostics are texts by the keys below. Both are read here alone: what
-decides by them takes ``parse`` and ``read_flag``. Nothing here reads a clock.
+The bridge publishes its state at each change, and at 2 Hz, because the latched topic would show
+``ACTIVE`` after the end of a bridge. The values of its diagnostics are texts with the keys below.
+Only this module reads these texts: other code calls ``parse`` and ``read_flag``. No function reads
+a clock.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class BridgeState(NamedTuple):
 
     @property
     def last_known(self) -> BridgeState:
-        """Return the state, or if the autopilot is lost the state before the loss."""
+        """Return the state; if the autopilot is lost, the state before the loss."""
         lost = self.name == NO_AUTOPILOT and self.reason.startswith(LOST)
         return parse(self.reason.removeprefix(LOST)) if lost else self
 
@@ -79,12 +80,12 @@ class BridgeState(NamedTuple):
 
 
 def read_flag(values: Mapping[str, str], key: str) -> bool | None:
-    """Return a value of diagnostics that is true or false, None if it is unknown."""
+    """Return a value of the diagnostics as True or False; None if the value is unknown."""
     return {'True': True, 'False': False}.get(values.get(key, ''))
 
 
 def parse(text: str) -> BridgeState:
-    """Return the state in a message; an unknown state, or none, counts as ``INACTIVE``."""
+    """Return the state in a message; an unknown or missing state counts as ``INACTIVE``."""
     name = ''.join(text.split()[:1]).partition(':')[0]
     reason = text.lstrip()[len(name):].lstrip(': \t\r\n')
     if name not in BRIDGE_STATES:
@@ -94,7 +95,7 @@ def parse(text: str) -> BridgeState:
 
 def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     """
-    Return the state of the bridge; a bridge that has been silent too long counts as absent.
+    Return the state of the bridge; absent if the bridge has been silent for too long.
 
     :param reported: the state in its last message; None without one.
     :param age: of that message, s, by a clock that neither stops nor jumps.

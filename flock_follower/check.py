@@ -17,14 +17,14 @@ Report the faults of a running system, or of a recording, before a flight.
 
 ``python -m flock_follower.check`` listens for some seconds to camera, odometry, our nodes and the
 autopilot's messages through the bridge. ``check BAG`` reads a recording, without ROS, and reports
-what is missing for ``evaluate``. Each line names a property, its measured value and the value it
-should have; the line below a fault says what to do.
+what is missing for ``evaluate``. Each line has a property, the measured value and the required
+value; the line below a fault has the remedy.
 
 A line that begins with ``?`` names a property that could not be measured, and why.
 
-Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, or if
-something essential was not measured, 2 for a wrong bag, file or option, or without ROS, 3 if only
-a busy computer prevents it.
+Exit codes: 0 if nothing prevents a flight (or the use of a bag); 1 if a fault prevents it, or an
+essential property was not measured; 2 for a wrong bag, file or option, or without ROS; 3 if only a
+busy computer prevents it.
 """
 
 from __future__ import annotations
@@ -195,8 +195,8 @@ def write_report(path: Path, seen: Observations, findings: Sequence[Finding],
     """
     Write the zip file of a bug report.
 
-    :param recording: a bag, of which the newest file is included, and the YAML files beside it;
-        None: there is none.
+    :param recording: a bag: its newest file, and the YAML files beside it, are included; None if
+        there is no bag.
     :raises OSError: naming the file, if it cannot be written.
     """
     with whole_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:

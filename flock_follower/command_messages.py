@@ -51,8 +51,8 @@ class Command(NamedTuple):
     """
     A command of the planner, from its tick to the setpoint gate.
 
-    ``stamp``, ns, is that of the estimate that the command is based on, 0 without one; the command
-    applies ``ahead`` ns later.
+    ``stamp``, ns, is the stamp of the estimate on which the command is based, 0 without an
+    estimate. The command applies ``ahead`` ns later.
     """
 
     acceleration: ArrayLike
@@ -127,8 +127,8 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     """
     Return the command of a MultiDOFJointTrajectory's first point.
 
-    :raises ValueError: if its frame is neither ``odom_frame`` nor ``RELATIVE``, or something
-        is missing.
+    :raises ValueError: if the frame is neither ``odom_frame`` nor ``RELATIVE``, or a field is
+        missing.
     """
     frame = message.header.frame_id
     if frame not in ('', odom_frame, RELATIVE):

@@ -15,9 +15,9 @@
 """
 Fast DDS of ROS 2: its profiles, and its shared memory.
 
-Names differ between version 2 (ROS 2 Jazzy) and 3 (Kilted). Discovery uses UDP. Messages pass
-through files in /dev/shm; a process locks the file ``NAME_el`` beside each of its own and removes
-both at its end.
+Names of settings differ between version 2 (ROS 2 Jazzy) and 3 (Kilted). Discovery uses UDP.
+Messages pass through files in /dev/shm. For each of its files NAME a process locks a file
+``NAME_el``, and removes both files when it ends.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def undelivered(opened: Iterable[str], user: int, folder: Path = SHARED_MEMORY) 
     """
     Return why this process receives nothing over shared memory, or ''.
 
-    If its files are removed (a login that ends), belong to another user, or lie in another
-    /dev/shm (a container), publishers are found, and their messages never arrive.
+    If the files were removed (when a login ended), belong to another user, or lie in another
+    /dev/shm (of a container), publishers are found, but their messages never arrive.
 
     :param opened: names of its open files. :param user: its user id.
     """

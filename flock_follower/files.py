@@ -25,7 +25,7 @@ def resource(relative: str) -> Path:
     """
     Return the path of a file or folder that the package ships, such as 'config/follower.yaml'.
 
-    An ament install (colcon) is looked at first, then the interpreter's prefix (pip), then the
+    The function searches the ament install (colcon), then the interpreter's prefix (pip), then the
     source tree, because an editable install copies no data files.
 
     :raises FileNotFoundError: naming every place that was searched.
@@ -46,8 +46,8 @@ def read_text(path: str | Path) -> str:
     """
     Return the text of a file.
 
-    :raises OSError: naming the file, also if the disk fails while it is read.
-    :raises ValueError: if it is not UTF-8.
+    :raises OSError: naming the file, also if the disk fails during reading.
+    :raises ValueError: if the file is not UTF-8.
     """
     try:
         return Path(path).read_text(encoding='utf-8')

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the nodes that a flight needs, together: no node loads this module."""
+"""The parameters of all nodes that a flight needs; no node loads this module."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ TABLE: Final = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER,
 def refuse_start(files: Sequence[str | Path], given: Mapping[str, Mapping[str, Any]],
                  namespace: str) -> None:
     """
-    Refuse parameters with which a node ends at each start: a launch would restart it for ever.
+    Refuse parameters with which a node ends at its start: a launch would restart it for ever.
 
-    :param files: parameter files. :param given: values of parameters beside them, by node.
+    :param files: parameter files. :param given: values set in addition to the files, by node.
     :param namespace: of the nodes.
     :raises ValueError, OSError: naming the file or the parameter.
     """

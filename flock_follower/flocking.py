@@ -25,13 +25,13 @@ An agent i at x_i with velocity v_i accelerates with (eqs. 4 and 5 of the paper)
     f0(r^2) = 1 / (r^2 - d0)^theta   f1(r^2) = 1 / (d1 - r^2)^theta
     L^2 = (1/k) sum_{i>j} |v_i - v_j|^2 = sum_i |v_i - mean(v)|^2
 
-which keeps ``d0 < r^2 < d1``: d0 and d1 bound the *squared* distance. The paper prints
-f1 = 1 / (r^2 - d1)^theta, the same for even theta only: for odd theta that repels, and for a
-theta that is not an integer it is not real. The paper's alpha appears in no formula.
+The law keeps ``d0 < r^2 < d1``: d0 and d1 bound the *squared* distance. The paper prints f1 = 1 /
+(r^2 - d1)^theta, which is equal for even theta only: for odd theta this f1 repels, and for a theta
+that is not an integer it is not a real number. The paper's alpha appears in no formula.
 
-The law has no value outside the band. Here the gaps r^2 - d0 and d1 - r^2 are taken as at least
-1e-6 m^2, so that too close always repels and too far always attracts, strongly but finitely.
-Both are zero while L = 0, that is while all velocities are equal.
+The paper's law has no value outside the band. Here the gaps r^2 - d0 and d1 - r^2 are at least
+1e-6 m^2, so below d0 the force always repels, and beyond d1 it always attracts, strongly but
+finitely. Separation and cohesion are zero while L = 0, that is, while all velocities are equal.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class FlockingParams(Checked):
         """
         Return the acceleration (n,), m/s^2, of an agent that observes m neighbors.
 
-        A subclass may return that of another controller, for comparisons with the law.
+        A subclass may return the acceleration of another controller, for comparisons with the law.
 
         :param offsets: neighbors' positions minus the ego one, (m, n), m.
         :param differences: neighbors' velocities minus the ego one, (m, n), m/s.
@@ -97,15 +97,17 @@ class FlockingParams(Checked):
 def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
                   model: Model = 'flocking') -> Array:
     """
-    Return the acceleration (k, n), m/s^2, of every agent of a flock, each seeing all others.
+    Return the acceleration (k, n), m/s^2, of every agent of a flock; each observes all others.
 
-    The result turns and moves with its inputs, and sums to zero: the mean velocity is constant.
+    The accelerations rotate with the inputs, and do not depend on the origin. Their sum is zero:
+    the mean velocity is constant.
 
     :param positions: (k, n), n = 2 or 3, m.
     :param velocities: (k, n), m/s, in the same frame.
     :param model: 'flocking', the law; 'cucker_dong' (2010), the law without cohesion;
         'cucker_smale' (2007), its alignment alone.
-    :raises ValueError: for another model, other shapes, or values not finite or beyond 1e100.
+    :raises ValueError: for another model, other shapes, or values that are not finite or beyond
+        1e100.
     """
     x, v = checked(positions, velocities)
     return sum_over_neighbors(x[None, :] - x[:, None], v[None, :] - v[:, None],
@@ -117,7 +119,7 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
     """
     Return the law's command (n,), m/s^2, for one agent that observes its neighbors.
 
-    L is formed of the observed neighbors and the agent itself. Without neighbors it is zero.
+    L is computed from the agent and the observed neighbors. Without neighbors the command is zero.
 
     :param relative_positions: neighbors' positions minus the ego one, (m, n), n = 2 or 3, m.
     :param relative_velocities: neighbors' velocities minus the ego one, (m, n), m/s.

@@ -15,11 +15,12 @@
 """
 One command to follow: check, then arm, take off, offboard, engage; a key confirms each step.
 
-Run ``ros2 run flock_follower follow`` beside the nodes. It ends with the findings of ``check`` if
-these prevent a flight; if the vehicle is in the air already, it only lands or hands over. A line
-shows state, distance, reason and battery. If a step is refused, the reason is printed and the step
-stays due. The key l lands. Ctrl-C, SIGTERM and a closed terminal brake and hand over: the planner
-is disengaged, and the autopilot holds.
+Run ``ros2 run flock_follower follow`` while the nodes run. If findings of ``check`` prevent a
+flight, the command prints the findings and ends; if the vehicle is in the air already, the command
+only lands or hands over. A line shows state, distance, reason and battery. If a step is refused,
+the reason is printed, and the same step is requested again with its key. The key l lands. Ctrl-C,
+SIGTERM and a closed terminal brake and hand over: the planner is disengaged, and the autopilot
+holds.
 
 Exit code 0 after a landing, 130 after Ctrl-C, 1 if a node is missing or ``check`` finds a fault.
 """

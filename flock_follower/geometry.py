@@ -26,7 +26,7 @@ FLU        x forward, y left, z up                     bodies (``base_link``), R
 optical    x right, y down, z forward                  images, REP-103
 =========  ==========================================  ==============================
 
-Those of MAVLink are in ``ned``.
+The frames of MAVLink are in ``ned``.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def normalize_quaternion(q: ArrayLike) -> Array:
     """
     Return the quaternion scaled to unit length.
 
-    :raises ValueError: if it is not four finite numbers, or its length is below 1e-6.
+    :raises ValueError: if the quaternion is not four finite numbers, or its length is below 1e-6.
     """
     a = np.asarray(q, dtype=float)
     norm = math.sqrt(a.dot(a)) if a.shape == (4,) else math.nan
@@ -73,7 +73,7 @@ def normalize_quaternion(q: ArrayLike) -> Array:
 
 
 def canonical_quaternion(q: ArrayLike) -> Array:
-    """Return q or -q, the same rotation, whichever has w >= 0."""
+    """Return q, or -q (the same rotation) if w is negative."""
     a = np.asarray(q, dtype=float)
     return -a if a[3] < 0.0 else a
 

@@ -15,9 +15,9 @@
 """
 Conversion of messages to numpy and back; the only module that reads and writes their fields.
 
-It works with any message classes: rclpy's in the nodes, the type store's when bags are read. To
-build a message, the caller passes ``make``, which returns an empty message of a type such as
-'nav_msgs/msg/Odometry'.
+The functions work with any message classes: rclpy's in the nodes, the type store's when bags are
+read. To build a message, the caller passes ``make``, which returns an empty message of a type such
+as 'nav_msgs/msg/Odometry'.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def read_stamp(stamp: Any) -> int:
     """
     Return the stamp, or the duration, of a received message as integer nanoseconds.
 
-    :raises ValueError: if its nanoseconds are not part of a second: beyond 2**31 s the sum would
-        fit into no stamp.
+    :raises ValueError: if the nanoseconds are not below a second: beyond 2**31 s no stamp can hold
+        the sum.
     """
     nanosec = int(stamp.nanosec)
     if not 0 <= nanosec < NANOSECONDS:  # the check itself takes ten times as long
@@ -114,7 +114,7 @@ def set_stamp(stamp: Any, nanoseconds: int) -> None:
 
 
 def stamp_age(stamp: int, now: int) -> float:
-    """Return the age, s, of a stamp at a time, both in ns; a zero stamp means now."""
+    """Return the age, s, of a stamp at a time, both in ns; a stamp of 0 has the age 0."""
     return (now - stamp) / NANOSECONDS if stamp > 0 else 0.0
 
 
@@ -140,8 +140,8 @@ class OdometryState(NamedTuple):
     ``stamp`` ns; ``position`` (3,), m; ``quaternion`` (x, y, z, w); ``velocity`` (3,), m/s, in the
     header's frame; ``angular_velocity`` (3,), rad/s, in the child frame; ``pose_covariance`` and
     ``twist_covariance`` (6, 6) as in the message; ``twist_rotation`` (3, 3) takes the message's
-    linear velocity to the header's frame. ``derived``: the velocity comes from the positions.
-    ``acceleration`` (3,), m/s^2, in the header's frame; None if it is unknown.
+    linear velocity to the header's frame. ``derived``: whether the velocity was derived from the
+    positions. ``acceleration`` (3,), m/s^2, in the header's frame; None if it is unknown.
     """
 
     stamp: int
@@ -221,8 +221,8 @@ def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike
     """
     Return an Odometry message; the twist is given, and sent, in the child frame (REP-105).
 
-    ``stamp`` in ns. Covariances are (6, 6), in the order x, y, z, rotations about x, y, z; None
-    sends zeros, which means unknown.
+    ``stamp`` in ns. Covariances are (6, 6), in the order x, y, z, rotations about x, y, z. None
+    becomes zeros, which means unknown.
     """
     message = make(ODOMETRY)
     set_stamp(message.header.stamp, stamp)

@@ -25,14 +25,14 @@ A file holds the dictionary of the markers and a list of neighbors::
         position: [-0.20, 0.0, 0.0]         # marker center on the neighbor's body (FLU), m
         rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
 
-A neighbor that carries several has, instead of the last four keys, a list of them::
+A neighbor with several markers has a list of markers instead of the last four keys::
 
       - name: leader
         markers:
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
-A neighbor whose pose another detector measures has, instead of markers, its source::
+If another detector measures the neighbor's pose, the entry has a source instead of markers::
 
       - name: leader
         pose_topic: /tracker/leader   # PoseStamped, PoseWithCovarianceStamped or Odometry
@@ -40,21 +40,23 @@ A neighbor whose pose another detector measures has, instead of markers, its sou
         attitude_std: 0.1        # rad, per axis: of messages without a covariance
         position_only: false     # true: its attitude is not used
 
-or ``tf_frame: leader`` instead of ``pose_topic``: its frame on ``/tf``; both deviations are then
-needed. ``frames_topic`` beside ``neighbors``, if none has markers: a topic with a header, of one
-message for each image that the other detector processes, with a neighbor in it or not.
+Instead of ``pose_topic``, ``tf_frame: leader`` names its frame on ``/tf``; then both deviations
+are required. If no neighbor has markers, the key ``frames_topic`` at the level of ``neighbors``
+names a topic with a header, with one message for each image that the other detector processes,
+whether it finds a neighbor or not.
 
 Each neighbor may have keys for the planner::
 
         role: follower           # leader (the default), follower, or avoid: kept clear of only
         radius: 0.3              # m, of its hull: distances are kept between hulls; 0
 
-``tag_position: [x, y, z]``, m, on its body, is the antenna that ranges are measured to;
-without it ranges are measured to the body's origin.
+``tag_position: [x, y, z]``, m, is the place of the antenna for ranges on the body; by default the
+body's origin.
 
-The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
+The marker frame is OpenCV's: seen from the front, x points right and y up; z points out of the
+marker.
 
-This module knows the dictionaries of markers by name and size alone: it needs no OpenCV.
+This module needs only the names and sizes of the dictionaries, not OpenCV.
 """
 
 from __future__ import annotations
@@ -104,7 +106,7 @@ _OWN_FRAMES = ('base_link', 'map', 'odom')
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A marker: its id, its side, m, and where it sits on its neighbor's body (FLU)."""
+    """A marker: its id, its side, m, and its place on the neighbor's body (FLU)."""
 
     marker_id: int
     side_length: float
@@ -113,7 +115,7 @@ class Marker:
 
 @dataclass(frozen=True)
 class PoseSource:
-    """The topic, or the frame on ``/tf``, by which another detector sends a neighbor's pose."""
+    """The topic, or the frame on ``/tf``, on which another detector sends a neighbor's pose."""
 
     topic: str = ''
     tf_frame: str = ''
@@ -126,7 +128,7 @@ class PoseSource:
 
 @dataclass(frozen=True, eq=False)
 class MarkedNeighbor:
-    """One neighbor and the markers on its body: without markers if it has a ``source``."""
+    """One neighbor and the markers on its body; without markers if it has a ``source``."""
 
     name: str
     markers: tuple[Marker, ...]
@@ -142,7 +144,7 @@ class MarkedNeighbor:
 
 @dataclass(frozen=True, eq=False)
 class NeighborConfig:
-    """The neighbors to look for; names and marker ids are unique, all of one dictionary."""
+    """The neighbors to look for; names and ids are unique, the ids of one dictionary."""
 
     dictionary: str
     """Of all markers; '' without any."""

@@ -45,13 +45,13 @@ REASONS: dict[str, str] = {
     '0.2 s': 'two facts: perception_timeout, and the least predict_timeout',
     '0.25 m': 'two facts: a step of a frame, and the size of a marker',
     '0.25 s': 'two facts: a clock that is behind, and a gap of the odometry',
+    '0.3 m': 'two facts: what a row of check can show, and what was simulated',
     '0.3 s': 'two facts: odometry that is missing, and a stamp that is ahead',
     '0.5 s': 'two facts: the fading of an edge, and the age of an estimate',
     '0.6 s': 'two facts: the autopilot, and the reaction of the bridge to it',
-    '10 Hz': 'the same simulated detector in two measurements',
-    '150 ms': 'the same simulated detector in two measurements',
-    '20 %': 'the same simulated detector in two measurements',
+    '0.9 m': 'the distance by which several tables count runs',
     '50 Hz': 'two facts: odometry that is received, and telemetry',
+    '50 ms': 'two facts: a late cycle, and a simulated offset of stamps',
     '60 s': 'two facts: engage_timeout, and the length of the chart',
 }
 

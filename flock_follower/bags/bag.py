@@ -15,12 +15,12 @@
 """
 Read bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
 
-For every format, a reader returns ROS 2 Jazzy types serialized as CDR. ROS 2 messages pass
-through undecoded; ROS 1 messages are migrated (``Header.seq`` dropped, ``time`` and ``duration``
-to ``builtin_interfaces``, fields in lower case, as ``CameraInfo``'s D, K, R, P).
-Every failure is a :class:`BagError` whose message is one line. Damage inside a message is detected
-only if the format has a checksum: MCAP chunks (always in the bags written here) and ROS 1
-chunks compressed with bz2.
+For every format, a reader returns ROS 2 Jazzy types serialized as CDR. ROS 2 messages are returned
+without decoding. ROS 1 messages are converted: ``Header.seq`` is dropped, ``time`` and
+``duration`` become ``builtin_interfaces``, and names of fields become lower case, such as
+``CameraInfo``'s D, K, R, P. Every failure is a :class:`BagError` whose message is one line. Damage
+inside a message is detected only if the format has a checksum: MCAP chunks (always in the bags
+written here) and ROS 1 chunks compressed with bz2.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ def serialize(message: Any, msgtype: str) -> bytes:
 
 def deserialize(data: bytes, msgtype: str) -> Any:
     """
-    Return the typestore message held in CDR bytes; its arrays, as pixels, are views of them.
+    Return the typestore message in CDR bytes; its arrays, such as pixels, are views of the bytes.
 
-    :raises BagError: the type is not one of ROS 2 Jazzy's, or the bytes do not fit it.
+    :raises BagError: if ROS 2 Jazzy does not have the type, or the bytes do not fit the type.
     """
     if msgtype not in typestore().types:
         raise BagError(f'unknown message type {msgtype}')
@@ -90,8 +90,8 @@ class Bag(AbstractContextManager['Bag']):
     """
     An open bag; use :func:`open_bag`, and ``with`` to close it.
 
-    ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
-    read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message;
+    ``topics`` maps names to :class:`Topic`; ``skipped`` maps each topic that cannot be read to the
+    reason. ``start_ns`` and ``end_ns`` are the stamps of the first and last message.
     ``incomplete`` is the reason if the bag was never finished, else ''.
     """
 
@@ -129,10 +129,10 @@ class Bag(AbstractContextManager['Bag']):
     @property
     def set_back_ns(self) -> int:
         """
-        Return by how much the clock was set back during the recording, ns, else about 0.
+        Return by how much the clock was set back during the recording, ns; about 0 if it was not.
 
-        Messages are returned in the order of their times: those before and after the step are
-        mixed.
+        Messages are returned in the order of their times, so messages from before and after the
+        step are mixed.
         """
         if isinstance(self._reader, SequentialReader):
             return max(self._reader.disorder, overlap(self._reader.spans.values()))
@@ -152,9 +152,9 @@ class Bag(AbstractContextManager['Bag']):
 
     def select(self, topics: Collection[str] = ()) -> list[str]:
         """
-        Return the absolute names of the topics requested, all readable ones if none are named.
+        Return the absolute names of the requested topics; of all readable topics if none is named.
 
-        :raises BagError: the bag does not hold one of them, or cannot read it.
+        :raises BagError: if a requested topic is not in the bag, or cannot be read.
         """
         names = list(dict.fromkeys(map(absolute, topics))) or list(self.topics)
         for name in names:
@@ -172,7 +172,7 @@ class Bag(AbstractContextManager['Bag']):
         """
         Yield the messages of the given topics with ``start_ns <= stamp_ns < stop_ns``, in order.
 
-        :raises BagError: an unknown topic, or data that is corrupt or incomplete.
+        :raises BagError: if a topic is unknown, or data is corrupt or incomplete.
         """
         names = self.select(topics)
         yielded = 0
@@ -218,7 +218,7 @@ def open_bag(path: str | Path) -> Bag:
     If rosbags refuses a file, or cannot read its last message, the file is read sequentially. An
     unfinished MCAP file is read up to its last whole chunk, see ``Bag.incomplete``.
 
-    :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
+    :raises BagError: if the bag is missing, empty, corrupt, truncated or of an unknown format.
     """
     path = Path(path).expanduser()
     if not path.exists():

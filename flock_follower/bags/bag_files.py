@@ -38,8 +38,8 @@ class BagFiles(NamedTuple):
     """
     The files of a bag, in the order in which they were written.
 
-    ``fault`` is the reason if it is incomplete, else ''; ``compressed``: whether ``metadata.yaml``
-    says that the files or the messages in them are compressed as a whole.
+    ``fault`` is the reason if the bag is incomplete, else ''. ``compressed`` is whether the files,
+    or the messages in them, are compressed as a whole by ``metadata.yaml``.
     """
 
     paths: list[Path]
@@ -61,10 +61,9 @@ def find_files(path: Path) -> BagFiles:
     """
     Return the files of a bag, which may be one bare file.
 
-    :raises ValueError: there is none, or an SQLite file was never closed, or was cut short: its
-        readers ignore rows in a write-ahead log, and read zeros for missing bytes, as if nothing
-        were missing.
-    :raises OSError: the folder or ``metadata.yaml`` cannot be read.
+    :raises ValueError: if there is no file, or if an SQLite file was never closed, or was cut
+        short: readers of SQLite ignore rows in a write-ahead log, and read missing bytes as zeros.
+    :raises OSError: if the folder or ``metadata.yaml`` cannot be read.
     """
     files = BagFiles([path], '') if path.is_file() else _in_folder(path)
     for file in files.paths:
@@ -81,9 +80,9 @@ def find_files(path: Path) -> BagFiles:
 
 def has_end(file: Path) -> bool:
     """
-    Return whether an MCAP file ends as a finished one does.
+    Return whether an MCAP file has the end of a finished file.
 
-    :raises OSError: it cannot be read.
+    :raises OSError: if the file cannot be read.
     """
     with file.open('rb') as opened:
         size = opened.seek(0, os.SEEK_END)

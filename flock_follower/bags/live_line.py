@@ -26,7 +26,7 @@ LOG_PERIOD = 5.0  # s between lines in a log
 
 
 class LiveLine:
-    """Prints to a stream, stdout if none is given; times are s on a monotonic clock."""
+    """Prints a line to a stream, by default stdout; times are s on a monotonic clock."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stdout

@@ -13,16 +13,15 @@
 # limitations under the License.
 
 """
-An MCAP file with an index and checksums: the one writer of bags and of recordings in flight.
+An MCAP file with an index and checksums; bags and recordings in flight use this writer.
 
-On request every write is flushed to the disk: a recording has to survive a kill or
-a power cut. Profile ``ros2``, chunks that are not compressed, an index behind each, and a summary
-at the end (https://mcap.dev/spec, which names the records). A file without its end is good up to
-its last whole chunk, see ``bags.sequential``.
+On request every write is flushed to the disk, because a recording must survive a kill or a power
+cut. The file has the profile ``ros2``, chunks without compression, an index after each chunk, and
+a summary at the end (https://mcap.dev/spec has the names of the records). If the end of a file is
+missing, its whole chunks can still be read, see ``bags.sequential``.
 
-Beside the files of a bag lies its ``metadata.yaml``. A bag's folder holds a file MARK from when it
-is made until it is finished. If writing ended otherwise (a full disk, an exception, a kill), the
-mark stays.
+The folder of a bag also holds ``metadata.yaml`` and, until the bag is finished, a file MARK. If
+writing ends early (full disk, exception, kill), MARK remains.
 """
 
 from __future__ import annotations
@@ -89,11 +88,11 @@ class McapFile:
     """
     One MCAP file that is being written.
 
-    ``size`` [bytes] and ``counts``, messages by topic, describe the file on disk; ``start_ns`` and
-    ``end_ns`` are the stamps of its first and last message, 0 without one.
+    ``size`` [bytes] and ``counts``, messages by topic, describe the file on disk. ``start_ns`` and
+    ``end_ns`` are the stamps of its first and last message; 0 without a message.
 
     :param durable: whether the data is on the disk when ``write`` returns.
-    :raises OSError: it exists, or cannot be written.
+    :raises OSError: if the file exists already, or cannot be written.
     """
 
     def __init__(self, path: Path, durable: bool = True) -> None:
@@ -118,8 +117,8 @@ class McapFile:
         """
         Write messages as one chunk, in the order of their stamps.
 
-        :raises OSError: if that fails; the file ends where it did before, and only ``close``
-            makes sense after it.
+        :raises OSError: if writing fails; the file then ends as before the call, and only
+            ``close`` may be called.
         :raises KeyError: for a type that ROS 2 Jazzy does not have.
         """
         if not messages:
@@ -238,7 +237,7 @@ def mark_incomplete(folder: Path) -> None:
     """
     Mark a bag as not finished.
 
-    :raises OSError: that cannot be written.
+    :raises OSError: if the mark cannot be written.
     """
     (folder / MARK).write_text(f'This bag is incomplete: {_UNFINISHED}\n')
 
@@ -259,7 +258,7 @@ def finish(folder: Path, files: Sequence[McapFile]) -> None:
     """
     Write the ``metadata.yaml`` of a bag of several closed files, and remove its mark.
 
-    :raises OSError: if that fails.
+    :raises OSError: if ``metadata.yaml`` cannot be written, or the mark cannot be removed.
     """
     counts: Counter[RecordedTopic] = Counter()
     for file in files:

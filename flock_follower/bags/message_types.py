@@ -74,7 +74,7 @@ def migration_obstacle(msgtype: str, definition: str) -> str | None:
     """
     Return why a ROS 1 message type cannot become its ROS 2 Jazzy type, or None.
 
-    :param definition: the definition recorded in the bag, with those of the types it holds.
+    :param definition: the recorded definition of the type, and of the types of its fields.
     """
     if msgtype not in typestore().types:
         return f'type {msgtype} does not exist in ROS 2 Jazzy'

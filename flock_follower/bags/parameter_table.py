@@ -46,7 +46,8 @@ def recordings_folder(values: Mapping[str, Any], ros_home: str, namespace: str) 
     """
     Return the folder of the recordings; ``ros_home`` is $ROS_HOME, or ''.
 
-    A user without a home folder (a container's) has / instead, as with an empty $HOME.
+    For a user without a home folder (in a container), and with an empty $HOME, the home folder is
+    /.
     """
     folder = Path(values['record_folder']) if values['record_folder'] else (
         Path(ros_home or '~/.ros') / 'flock_follower' / 'black_box' / namespace.strip('/'))

@@ -16,7 +16,7 @@
 Recordings in flight: one folder each, in files of limited size; the oldest files are deleted.
 
 Each recording is a ROS 2 bag of several MCAP files. The data is on the disk when ``write``
-returns. Text files lie beside them, see ``note``.
+returns. ``note`` adds text files to the folder.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ KEPT = 15  # the newest files, which are never deleted: at 1.5 MB/s the last 10 
 
 class FlightRecording:
     """
-    The recordings in a folder, and the current recording, which begins with the first message.
+    The recordings in a folder; the first message begins the current recording.
 
     :param folder: for the recordings of one vehicle; created if missing.
     :param disk_used: largest size of all recordings, MB.
     :param disk_free: space that stays free on the disk, MB.
-    :raises OSError: it cannot be made, or another process records there.
+    :raises OSError: if the folder cannot be made, or another process records there.
     """
 
     def __init__(self, folder: Path, disk_used: float, disk_free: float) -> None:
@@ -78,9 +78,9 @@ class FlightRecording:
 
     def note(self, name: str, text: str) -> None:
         """
-        Write a text file beside the recording, and beside those that follow.
+        Write a text file into the folder of this recording, and of each later recording.
 
-        :raises OSError: it cannot be written.
+        :raises OSError: if the file cannot be written.
         """
         self._notes[name] = text
         if self.path is not None:
@@ -92,8 +92,8 @@ class FlightRecording:
         Write messages, and return once the disk holds them.
 
         :param now: s of a monotonic clock.
-        :raises OSError: if that fails; none of the messages is kept then, the file is
-            closed, and the next ones go into a new one.
+        :raises OSError: if writing fails; these messages are then lost, the file is closed, and
+            the next messages go into a new file.
         """
         if not messages:
             return
@@ -124,7 +124,7 @@ class FlightRecording:
         """
         Finish the current recording.
 
-        :raises OSError: if that fails; the recording stays readable.
+        :raises OSError: if the summary cannot be written; the recording can still be read.
         """
         try:
             self._end()

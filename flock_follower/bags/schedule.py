@@ -15,8 +15,8 @@
 """
 The schedule of playback: the time at which each message of a bag is published. No clock is read.
 
-Wall time is float seconds of any monotonic clock and always passed in; bag time is integer
-nanoseconds.
+Wall time is in float seconds of any monotonic clock, and always an argument; bag time is in
+integer nanoseconds.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ class Timeline:
     """
     The position of playback in the bag, and the time at which a stamp falls due.
 
-    Both follow from one anchor (this wall time is that bag time), so errors of single waits never
-    add up. Position never moves before the anchor's wall time: an anchor in the future is a
-    lead-in.
+    Both follow from one pair of a wall time and a bag time, the anchor, so errors of single waits
+    never add up. Before the anchor's wall time the position does not move: an anchor in the future
+    delays the start.
     """
 
     def __init__(self, start_ns: int, rate: float, now: float) -> None:

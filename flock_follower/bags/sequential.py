@@ -15,10 +15,10 @@
 """
 Sequential reader of ROS 2 recordings: needs no index, and changes no file.
 
-rosbags needs a file's end and its index, and a folder's ``metadata.yaml``, and refuses a file for
-one channel that is not of ROS 2. This reader needs none of them: it takes the files one after the
-other, one in MCAP without an end up to its last good chunk. The reader uses only the files'
-content. MCAP files are read by the library mcap; on a vehicle it need not be installed.
+rosbags needs the end and the index of a file, and the ``metadata.yaml`` of a folder, and refuses a
+file if one channel is not of ROS 2. This reader needs only the content of the files, and reads the
+files one after the other; an MCAP file without an end is read up to its last whole chunk. The
+library mcap reads MCAP files; a vehicle does not need this library.
 
 ``in_order`` and ``overlap`` serve both readers: the files of a folder may overlap in time.
 """
@@ -76,9 +76,9 @@ class SequentialReader:
     """
     Files of a recording, read one after the other, with rosbags' interface of a reader.
 
-    Messages come in the order of their stamps within each file, and see ``in_order``.
-    ``start_time`` is the stamp of the first message, ``end_time`` a nanosecond more than that of
-    the last, ns.
+    The messages of each file are in the order of their stamps; ``in_order`` gives the order of
+    several files. ``start_time`` is the stamp of the first message, ``end_time`` one nanosecond
+    more than the stamp of the last message, ns.
     """
 
     def __init__(self, files: Sequence[Path]) -> None:
@@ -165,10 +165,10 @@ def overlap(files: Iterable[Span]) -> int:
 
 def in_order(files: Sequence[tuple[Span, Iterator[_Message]]]) -> Iterator[_Message]:
     """
-    Yield the messages of files, of which each has its messages in the order of their stamps.
+    Yield the messages of several files; each file has its messages in the order of their stamps.
 
-    Files that overlap in time are merged by the stamps; others keep their order, in which a clock
-    that was set back between two of them shows.
+    Files that overlap in time are merged by the stamps. Other files are read one after the other,
+    so a clock that was set back between two files remains visible.
     """
     groups: list[list[int]] = []
     for number, (span, _) in enumerate(files):

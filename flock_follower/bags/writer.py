@@ -41,13 +41,13 @@ class BagWriter(AbstractContextManager['BagWriter']):
     Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
 
     The bytes written depend only on the calls made and the directory's name, never on a clock, so
-    a regenerated bag is identical. After a failure inside the ``with`` block, or of the disk, all
-    but the last chunk of 1 MiB is kept and marked incomplete, see ``bags.mcap_file``. An empty
-    bag is deleted then.
+    a regenerated bag is identical. After an exception inside the ``with`` block, or a failure of
+    the disk, the bag lacks the last chunk of 1 MiB, and is marked incomplete, see
+    ``bags.mcap_file``. If the bag is then empty, it is deleted.
 
     :param path: directory to create; it must not exist.
     :param latched: topics recorded as transient local; all others are reliable and volatile.
-    :raises BagError: the bag exists already or the place cannot be written.
+    :raises BagError: if the bag exists already, or the folder cannot be written.
     """
 
     def __init__(self, path: str | Path, latched: Collection[str] = ()) -> None:
@@ -71,7 +71,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         :param msgtype: type name as in ``'nav_msgs/msg/Odometry'``.
         :param stamp_ns: recording time [ns].
         :param message: a message of :func:`typestore`, or its CDR bytes.
-        :raises BagError: the type is unknown, the topic has another type, or the disk is full.
+        :raises BagError: if the type is unknown, the topic has another type, or the disk is full.
         """
         data = message if isinstance(message, bytes) else serialize(message, msgtype)
         self._pending.append(TakenMessage(self._topic(topic, msgtype), stamp_ns, data))
@@ -83,8 +83,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         """
         Finish the bag: its index and ``metadata.yaml``.
 
-        :raises BagError: if that fails; messages written until then are kept, and marked
-            incomplete.
+        :raises BagError: if writing fails; the messages written before are kept, and the bag is
+            marked incomplete.
         """
         self._flush()
         with failures(self.path, 'cannot be finished'):

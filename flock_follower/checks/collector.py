@@ -67,7 +67,8 @@ class Collector:
     """
     Fills ``observations``.
 
-    :param duration: length of the observation, s: of a long bag few images are searched.
+    :param duration: length of the observation, s: the longer, the smaller the share of images that
+        are searched.
     """
 
     def __init__(self, observations: Observations, duration: float) -> None:
@@ -165,8 +166,8 @@ class Collector:
         """
         Read the odometry if that was not done, and search the images for markers.
 
-        ``sightings`` get a row for each marker of ours whose edges show its position: stamp, s;
-        id; position (3), m, of the marker in the camera (optical).
+        ``sightings`` gets a row for each configured marker whose edges show its position: stamp,
+        s; id; position (3), m, of the marker in the camera's optical frame.
         """
         seen, markers = self.observations, config.by_marker()
         if seen.own is None:

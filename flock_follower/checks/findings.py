@@ -66,7 +66,7 @@ class Finding(NamedTuple):
 
 def grade(bad: bool, poor: bool, what: str, measured: str, wanted: str,
           advice: str) -> Finding:
-    """Return an error if ``bad``, a warning if only ``poor``, else OK without the advice."""
+    """Return an error if ``bad``, else a warning if ``poor``, else OK without advice."""
     if bad or poor:
         return Finding(ERROR if bad else WARNING, what, measured, wanted, advice)
     return Finding(OK, what, measured, wanted)
@@ -76,14 +76,14 @@ def first(what: str, wanted: str, *cases: tuple[Any, str, str, str]) -> Finding:
     """
     Return the finding of the first case whose condition is true; one condition must be true.
 
-    :param cases: whether it holds, the level, the value measured, and the advice, '' if OK.
+    :param cases: each has the condition, the level, the measured value, and the advice, '' if OK.
     """
     return next(Finding(level, what, measured, wanted, advice)
                 for holds, level, measured, advice in cases if holds)
 
 
 def without_consequences(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the findings without those that only result from another finding."""
+    """Return the findings without the findings that only result from another finding."""
     findings = list(findings)
     faulty = {finding.what for finding in findings if finding.level == ERROR}
     return [finding for finding in findings if not faulty.intersection(

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of planner and bridge, judged together with the camera and the marker."""
+"""Check of the parameters of planner and bridge, together with the camera and the marker."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ JUDGED_NODES = ('planner', 'mavlink_bridge')
 
 
 def check_settings(seen: Observations) -> Iterator[Finding]:
-    """Check that the parameters of a live system can fly; a bag is judged with ours."""
+    """Check the parameters of a live system; a bag is checked with the given parameters."""
     wanted = 'parameters that can fly'
     missing = ', '.join(node for node in JUDGED_NODES if not seen.parameters.get(node))
     if missing and seen.live:

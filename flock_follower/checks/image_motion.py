@@ -15,13 +15,13 @@
 """
 Comparison of image motion with odometry: finds wrong axes, clock, mounting, and focal length.
 
-A camera that turns by a small rotation vector r (its own axes: x right, y down, z ahead) sees the
-scene move by (-f r_y, f r_x) px, at any distance. A translation d adds (-f d_x, -f d_y) / depth,
-with a smaller mean. So the shift of the image gives two of the three components of r
-for each pair of images. Many pairs give the rotation between body and camera: of the 24 rotations
-that lay three axes onto three others, the one that explains the shifts best. A least-squares fit
-then gives the small rotation that remains, and the ratio of the shifts to those expected from the
-calibration: the error of the focal length.
+If a camera turns by a small rotation vector r (camera axes: x right, y down, z ahead), its image
+moves by (-f r_y, f r_x) px at any distance of the scene. A translation d adds (-f d_x, -f d_y) /
+depth, with a smaller mean. So the shift between two images gives two of the three components of r.
+Many pairs of images give the rotation between body and camera: of the 24 rotations that map three
+axes to three axes, the rotation that explains the shifts best. A least-squares fit then gives the
+remaining small rotation, and the ratio of measured to expected shifts, which is the error of the
+focal length.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ MAX_GAP = 0.3
 
 
 class OwnPath:
-    """The ego motion by the states of an odometry, in the order of their stamps."""
+    """The ego motion: the states of the odometry, in the order of their stamps."""
 
     def __init__(self, states: Sequence[OdometryState]) -> None:
         quaternions = np.array([state.quaternion for state in states])
@@ -134,8 +134,9 @@ def measure_shifts(before: Array, after: Array, width: int) -> Array:
     """
     Return the shift of each part of the image right and down, px at ``COMPARED_WIDTH``.
 
-    (PARTS, 3), the last column is the quality. A large shift of two windows at the same place is
-    measured too small, so they are compared again with windows that are that far apart.
+    The result is (PARTS, 3); the last column is the quality. Between two windows at the same place
+    a large shift is measured too small. So the windows are compared again, displaced by the
+    measured shift.
     """
     found = np.zeros((PART_ROWS * PART_COLUMNS, 3))
     if before.shape != after.shape:
@@ -159,12 +160,13 @@ class AxesFit(NamedTuple):
     """
     Shares of the squared shifts that rotation explains, up to 1.
 
-    ``configured`` is the share with the configured axes, ``best`` that with the best rotation
-    ``turn`` (3, 3), R_base_configured, the identity if none is better; each with the time offset
-    that suits it. ``mounting`` (3,), rad, along base_link's axes: beyond ``turn`` the camera is
-    mounted by exp(mounting) otherwise than configured. With it, ``explained`` is the share at the
-    best ``offset``, s, the camera's stamps minus those of the odometry, ``together`` that without
-    an offset. ``zoom``: ratio of the shifts to those expected from the calibration.
+    ``configured`` is the share with the configured axes, ``best`` the share with the best rotation
+    ``turn`` (3, 3), R_base_configured (the identity if no rotation is better); each with its own
+    best time offset. ``mounting`` (3,), rad, is the remaining rotation along base_link's axes:
+    beyond ``turn``, the camera is rotated by exp(mounting) from its configured attitude. With
+    ``mounting``, ``explained`` is the share at the best ``offset``, s (stamps of the camera minus
+    stamps of the odometry), and ``together`` the share without offset. ``zoom`` is the ratio of
+    the measured shifts to the shifts expected from the calibration.
     """
 
     configured: float
@@ -185,8 +187,8 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     Return the fit of the axes, or None if the images hardly moved.
 
     :param shifts: rows of stamp before, stamp after, and the numbers of :func:`measure_shifts`.
-    :param up: (3,), the upward direction in base_link as configured: besides the identity only
-        rotations that make it z are tried. None: it is z already, and all rotations are tried.
+    :param up: (3,), the measured upward direction in base_link as configured: only the identity,
+        and rotations of ``up`` to z, are tried. None: ``up`` is z, and all rotations are tried.
     """
     every = np.array(shifts).reshape(-1, 2 + 3 * PART_ROWS * PART_COLUMNS)
     # The leader may fill one part, so the median stands for the image.

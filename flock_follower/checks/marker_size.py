@@ -15,11 +15,11 @@
 """
 The size of a marker at rest, from the ratio of the change of distance to the camera's path.
 
-By odometry and image the marker must stay in place. If it approaches by more, or less, than the
-camera moves towards it, its size (or the focal length) is wrong. Both are taken along the mean
-line of sight, where an error of the mounting has no effect of first order.
+The measured distance to a marker at rest must change by as much as the camera moves towards the
+marker. If it changes by more, or less, the configured size (or the focal length) is wrong. Both
+changes are measured along the mean line of sight, so a mounting error has almost no effect.
 
-A moving leader can cause the same symptom. If the leader moves away by half the distance that the
+A moving leader can cause the same symptom: if the leader moves away by half the distance that the
 follower flies, the configured marker size seems too small. So a ratio counts only if it explains
 nearly all changes of the distance.
 """
@@ -72,7 +72,7 @@ class Ratio(NamedTuple):
     """
     Ratio of the changes of the measured distance to the true changes, and its standard deviation.
 
-    ``way``: RMS way of the camera, m; ``left``: RMS of the changes that remain, m.
+    ``way``: RMS displacement of the camera, m; ``left``: RMS of the unexplained changes, m.
     """
 
     ratio: float
@@ -117,7 +117,7 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
 def distance_ratio(arms: Array, positions: Array, rotations: Array, camera: Array
                    ) -> Ratio | None:
     """
-    Return the ratio of the changes of the distance to the way moved; None if sightings are few.
+    Return the ratio of measured to true changes of the distance; None if sightings are few.
 
     :param arms: (n, 3), m, from the camera to the marker as seen, along base_link's axes.
     :param positions: (n, 3), m, and :param rotations: (n, 3, 3) of base_link in odom.

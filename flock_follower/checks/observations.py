@@ -15,7 +15,7 @@
 """
 The observations of a running system or of a bag, which the checks judge.
 
-Times are s: stamps and arrivals in the time of ROS (of a bag, of its recording).
+Stamps and arrivals are in s of the time of ROS; in a bag, of the time of recording.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class TopicEnd(NamedTuple):
 
 @dataclass
 class TopicSeen:
-    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is missing."""
+    """A topic, with ``arrivals`` and ``stamps`` of its messages; 0 is a missing stamp."""
 
     publishers: list[TopicEnd] = field(default_factory=list)
     arrivals: list[float] = field(default_factory=list)
@@ -64,10 +64,11 @@ class Picture:
     """
     An image that was searched for markers.
 
-    ``brightness`` and ``contrast`` are mean and deviation of its gray levels; ``markers`` maps the
-    ids of the markers found to the length of their sides, px: of a neighbor's only those that
-    gave a measurement. ``outlines`` are the ids of the others, ``misprints`` why they were
-    refused. ``fault`` is the reason if the image cannot be decoded.
+    ``brightness`` and ``contrast`` are mean and standard deviation of the gray levels. ``markers``
+    maps the ids of detected markers to the length of their sides, px; markers of a neighbor only
+    if they gave a measurement. ``outlines`` are the ids of the neighbor's other markers,
+    ``misprints`` the reasons of their refusal. ``fault`` is the reason if the image cannot be
+    decoded.
     """
 
     stamp: float
@@ -97,11 +98,11 @@ class Machine:
     """
     The computer during the observation.
 
-    ``load``: of our nodes, None if it is unknown;
-    ``shared_memory_free``: MB in /dev/shm; ``dead_segments`` of killed processes there.
-    ``segment``: the size, bytes, of the shared memory through which images may come; 0: none.
-    ``reach``: from where our nodes on this computer are reached, None if that is unknown; that of
-    'check' itself if it sees none of them.
+    ``load`` is that of our nodes, None if unknown. ``shared_memory_free`` is the free space in
+    /dev/shm, MB; ``dead_segments`` are the files of killed processes there. ``segment`` is the
+    size, bytes, of the shared memory for images; 0 if there is none. ``reach``: which computers
+    can reach our nodes on this computer, None if unknown; if 'check' finds no node of ours, which
+    computers can reach 'check'.
     """
 
     load: Load | None = None
@@ -117,8 +118,8 @@ class OwnMotion:
     """
     The odometry, read as our nodes read it.
 
-    ``lost`` is the number of messages without attitude or position, ``last_error`` the reason of
-    the newest of them.
+    ``lost`` is the number of messages without attitude or position, ``last_error`` the reason for
+    the newest lost message.
     """
 
     source: OdometrySource
@@ -144,10 +145,11 @@ class SourceSeen:
     """
     The poses of a neighbor by another detector, as relative_pose takes them.
 
-    ``topic`` is '' for a frame on /tf; ``frame`` is that of the newest pose. Numbers of poses:
-    ``taken`` in all, ``refused`` by reason, ``used`` by the filter, ``outliers`` outside its gate,
-    ``outside`` of the sight of their camera, ``tilted`` far from upright. ``path``: all of them
-    compared with each other; ``on_body``: in a frame of the own body, not in that of odom.
+    ``topic`` is '' for a frame on /tf; ``frame`` is the frame of the newest pose. Numbers of
+    poses: ``taken`` in all, ``refused`` by reason, ``used`` by the filter, ``outliers`` outside
+    the filter's gate, ``outside`` of their camera's field of view, ``tilted`` far from upright.
+    ``path`` compares all poses with each other. ``on_body``: whether poses are in a frame of the
+    ego body, not in the frame of odom.
     """
 
     topic: str
@@ -168,9 +170,9 @@ class Observations:
     All observations.
 
     ``names`` maps our names of topics to their full names. ``calibration`` is the newest
-    CameraInfo. ``shifts`` are rows of image motion, see ``image_motion.fit_axes``, ``sightings``
-    rows of markers, see ``Collector.finish``. ``parameters`` are those of each of our nodes, by
-    its plain name.
+    CameraInfo. ``shifts`` are rows of image motion, see ``image_motion.fit_axes``; ``sightings``
+    are rows of markers, see ``Collector.finish``. ``parameters`` holds the parameters of each of
+    our nodes, by its name without namespace.
     """
 
     live: bool = True
@@ -213,20 +215,20 @@ class Observations:
 
     @property
     def has_markers(self) -> bool:
-        """Return whether images are needed: a neighbor has a marker."""
+        """Return whether a neighbor has a marker: then images are needed."""
         return bool(self.marker_sides) or not self.sources
 
     def status(self, node: str) -> NodeStatus | None:
-        """Return the newest status of a node of ours, by its plain name, or None."""
+        """Return the newest status of one of our nodes, by its name without namespace, or None."""
         return self.statuses.get(full_name(node, self.namespace).lstrip('/'))
 
     @property
     def busy(self) -> bool:
-        """Return whether the computer was too busy: then times in a fault are not judged."""
+        """Return whether the computer was too busy to judge rates and latencies."""
         return self.machine.load is not None and self.machine.load.busy
 
     def topic(self, name: str) -> TopicSeen:
-        """Return the observation of a topic of ours; an empty one if there is none."""
+        """Return the observation of one of our topics; empty if there is none."""
         return self.topics.get(self.names.get(name, ''), TopicSeen())
 
     @property
@@ -239,7 +241,7 @@ class Observations:
             not self.topic(wanted).publishers) else wanted
 
     def rate(self, topic: TopicSeen) -> float:
-        """Return the rate of messages, Hz, 0 before the second; without the gaps of a bag."""
+        """Return the rate of messages, Hz, without gaps of a bag; 0 if fewer than two came."""
         periods = np.diff(topic.arrivals)
         if self.gaps:
             periods = periods[np.abs(periods) <= MAX_GAP]

@@ -299,8 +299,8 @@ def check_mounting(turn: Array, deviations: Array, rpy: Sequence[float]) -> Find
     """
     Return the finding about roll, pitch and yaw of the camera.
 
-    :param turn: the rotation vector (3,), rad, along base_link's axes, by which the camera is
-        mounted otherwise than configured; :param deviations: (3,) of it.
+    :param turn: the rotation vector (3,), rad, along base_link's axes, from the configured to the
+        measured attitude of the camera; :param deviations: (3,), its standard deviations.
     :param rpy: the configured ``camera_rpy``, rad.
     """
     margin = SIGNIFICANT_SIGMAS * deviations

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Images: their calibration, their brightness, and the markers in them."""
+"""Checks of the images: calibration, brightness, and markers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def camera_model(seen: Observations) -> CameraModel:
     """
     Return the camera of the newest CameraInfo, as relative_pose reads it.
 
-    :raises ValueError: there is no calibration, or it is wrong.
+    :raises ValueError: if the calibration is missing or wrong.
     """
     info = seen.calibration
     if info is None:

@@ -15,12 +15,13 @@
 """
 The path of a neighbor through the poses of another detector: outliers, and an offset of stamps.
 
-The filter in flight must use a pose before the next one comes; a check has all of them. Each
-position is predicted from those before and after it, by the model of ``time_offset``: a path of
-any start, driven by white jerk. The ratio of jerk to noise is that which predicts best. Noise
-along the line of sight is separate from that across: that of most detectors is larger.
+In flight the filter knows only earlier poses; a check knows all poses. Each position is predicted
+from the positions before and after it, by the model of ``time_offset``: a path with any start,
+driven by white jerk. The ratio of jerk to noise is the ratio that predicts best. The noise along
+the line of sight is estimated separately, because it is larger for most detectors.
 
-The offset is the one of the grid of ``time_offset`` with the smoothest path, without the outliers.
+The offset is the value in the grid of ``time_offset`` that makes the path without outliers
+smoothest.
 """
 
 from __future__ import annotations
@@ -75,8 +76,9 @@ class PosePath(NamedTuple):
     """
     The poses of a neighbor against its path.
 
-    Numbers of poses: ``judged``, ``outliers`` among them. ``visible``, m: larger outliers are
-    found. ``offset`` of the exposures after their stamps, s, and its deviation.
+    ``judged`` is the number of poses, ``outliers`` the number of outliers among them. ``visible``,
+    m, is the size from which outliers are found. ``offset`` is the delay from the stamps to the
+    exposures, s, and its standard deviation.
     """
 
     judged: int = 0
@@ -147,8 +149,8 @@ def judge_path(times: Array, points: Array, odometry: WholeOdometry, on_body: bo
     """
     Return the outliers among poses, and the offset of their stamps.
 
-    :param times: their stamps (n,), s, in order; :param points: their positions (n, 3), m, on
-        the own body, or in odom if not ``on_body``: their offset is not known then.
+    :param times: their stamps (n,), s, in order; :param points: their positions (n, 3), m, on the
+        ego body, or in odom if not ``on_body``: then the offset cannot be measured.
     """
     windows = list(_windows(times, points, odometry, on_body))
     if not windows:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Poses of neighbors by another detector: published, in time, and used by the same gates."""
+"""Checks of the poses of another detector: publisher, latency, and use by the filter."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def judge_poses(config: NeighborConfig, arrivals: Mapping[str, Iterable[Arrival]
                 states: Iterable[OdometryState], cameras: Mapping[str, Transform],
                 static: StaticFrames, max_wait: float) -> dict[str, SourceSeen]:
     """
-    Return the outcome of the poses of each neighbor in the filter and gates of relative_pose.
+    Pass the poses of each neighbor through the filter of relative_pose; return the outcome.
 
     :param cameras: the optical frames of the ego cameras on the body, by name.
     :param max_wait: the longest time for which a pose waits for odometry of its stamp, s.

@@ -15,12 +15,11 @@
 """
 Whether the machine was too busy: measures how long processes waited for a processor.
 
-The kernel counts for each thread the time for which it ran, and for which it was ready and waited
-(``/proc/PID/task/TID/schedstat``). Processes that work together also wait for each other, on a
-quiet machine, too. So only the share of the waiting counts that other programs caused
-(``/proc/stat``). A process of ours that has ended has no file any more: its parent knows its
-processor time (``getrusage``). The files are there in a container. Without these files the load is
-unknown, and with an unknown load every bound is judged.
+The kernel counts for each thread the time in which it ran, and in which it was ready and waited
+(``/proc/PID/task/TID/schedstat``). Processes that work together wait for each other, on a quiet
+machine, too. So only the share of the waiting that other programs caused counts (``/proc/stat``).
+The processor time of a child that has ended comes from ``getrusage``. The files also exist in a
+container. Without these files the load is unknown, and every bound is judged.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _TICK: Final = 1.0 / os.sysconf('SC_CLK_TCK')  # s
 
 
 class Counters(NamedTuple):
-    """Readings at one time, s: ns waited of each thread, by its file; others in s."""
+    """Readings at one time, s: the waiting of each thread, ns, by its file; other values in s."""
 
     time: float
     waited: Mapping[Path, int]
@@ -156,7 +155,7 @@ def read_counters(process_ids: Iterable[int], now: float, proc: Path = PROC,
 
 
 def load_between(before: Counters, after: Counters, processors: int) -> Load:
-    """Return the load between two readings; a thread that only the second reading has is new."""
+    """Return the load between two readings; a thread only in the second reading is new."""
     waited = sum(_waits(before.waited, after.waited))
     ran = sum(ran - before.ran.get(process, 0.0) for process, ran in after.ran.items())
     gone = sum(ran for process, ran in before.ran.items() if process not in after.ran)
@@ -186,7 +185,7 @@ class LoadMeter:
         self._windows: list[tuple[float, Load]] = []
 
     def sample(self, now: float) -> None:
-        """Read the counters at a time, s; a call within LOAD_PERIOD of the last one is ignored."""
+        """Read the counters at a time, s; ignore a call within LOAD_PERIOD of the last reading."""
         if self._recent and now - self._recent[-1].time < LOAD_PERIOD:
             return
         counters = read_counters(

@@ -43,9 +43,10 @@ def find_reach(process: int, domain: int, proc: Path = Path('/proc')) -> Reach |
     """
     Return which computers can reach the ROS of a process; None if no socket of ROS is found.
 
-    A socket that is bound to the loopback interface is reached from this computer. So is one that
-    is bound to a multicast address: a computer elsewhere gets no answer from it. Firewalls are
-    not seen, nor is middleware that does not use the ports of DDS (Zenoh).
+    Only this computer can reach a socket that is bound to the loopback interface. A socket that is
+    bound to a multicast address counts in the same way, because another computer gets no answer
+    from it. The function detects neither firewalls nor middleware with other ports than DDS
+    (Zenoh).
 
     :param process: its id. :param domain: its ROS_DOMAIN_ID.
     """

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""All checks; observations of a running system and of a bag have the same form."""
+"""All checks, in one form for a running system and for a bag."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def judge_all(seen: Observations) -> list[Finding]:
     """
     Return the findings of every check, in the order in which they should be fixed.
 
-    Those that only follow from another one are left out.
+    Findings that only result from another finding are left out.
     """
     if seen.live and not seen.nodes:
         return [check_nodes(seen)]
@@ -76,9 +76,9 @@ class RecordedSystem:
     Takes the messages of a bag one by one, in order, and judges them.
 
     :param values: the parameters with which the bag is to be used, by node.
-    :param camera: the one of several to check; '': the first.
-    :param remaps: names of topics in the bag, by ours, if they differ.
-    :param own: filled by the caller, who reads the odometry anyway; None: it is read here.
+    :param camera: name of the camera to check if there are several; '': the first.
+    :param remaps: names of topics in the bag, by our names, if they differ.
+    :param own: the odometry, if the caller reads it anyway; None: it is read here.
     :raises ValueError: for a camera that does not exist, or a neighbors file that is wrong.
     :raises OSError: if the neighbors file cannot be read.
     """
@@ -120,18 +120,18 @@ class RecordedSystem:
                         and bag.topics[full].msgtype in POSE_TYPES and full not in self.topics}
 
     def is_long_enough(self, time_ns: int) -> bool:
-        """Return whether messages from a time, ns, on are not checked any more."""
+        """Return whether the check is complete at a time, ns: later messages are ignored."""
         return time_ns - self._start_ns - self._gaps.skipped_ns >= MAX_DURATION * NANOSECONDS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes, message: Any = None
              ) -> Any:
         """
-        Take a message; messages of other topics, and messages after the checked time, are ignored.
+        Take a message; ignore messages of other topics, and messages after the checked time.
 
-        Return its fields if they were read. If the bytes are no message of the type, the bag is
-        reported as incomplete.
+        Return the fields of the message if they were read. If the bytes are no message of the
+        type, the bag is reported as incomplete.
 
-        :param message: its fields, if they were read before.
+        :param message: the fields, if they were read before.
         """
         name = self.topics.get(topic)
         if step := self._gaps.take(time_ns):
@@ -153,7 +153,7 @@ class RecordedSystem:
         return message
 
     def findings(self) -> list[Finding]:
-        """Return the findings in all messages that were taken."""
+        """Return the findings of all messages taken."""
         self._collector.finish(self._neighbors)
         return judge_all(self.seen)
 

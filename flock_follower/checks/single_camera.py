@@ -24,9 +24,9 @@ from flock_follower.parameters.cameras import ALONE, cameras, CameraValues
 
 def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict[str, Any]]:
     """
-    Return a camera by name, or the first one, and the values for a system of only this camera.
+    Return a camera by name, or the first, and the values for a system with only this camera.
 
-    :raises ValueError: if none of them has that name.
+    :raises ValueError: if no camera has that name.
     """
     configured = cameras(values)
     found = next((camera for camera in configured if name in ('', camera.name)), None)

@@ -45,8 +45,8 @@ def check_stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tupl
 
     On a busy computer rate and latency are not judged if they are faulty.
 
-    :param rates: below which there is a warning, and an error, Hz; ``faster``: the advice.
-    :param latencies: above which there is a warning, and an error, s; ``sooner``: the advice.
+    :param rates: a lower rate is a warning, and an error, Hz; ``faster``: the advice.
+    :param latencies: a higher latency is a warning, and an error, s; ``sooner``: the advice.
     """
     if not topic.arrivals:
         return

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The computer; the reports of our nodes and of the autopilot on ``/diagnostics``."""
+"""Checks of the computer, and of what our nodes and the autopilot report on ``/diagnostics``."""
 
 from __future__ import annotations
 

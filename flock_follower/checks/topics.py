@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Nodes and topics: who publishes, at which rate and latency, by which clock."""
+"""Checks of nodes and topics: publishers, rates, latencies, clocks."""
 
 from __future__ import annotations
 

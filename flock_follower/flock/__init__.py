@@ -15,6 +15,7 @@
 """
 Several followers: their neighbor graph and their messages.
 
-Every vehicle's odometry has its own frame. The transform between two frames is estimated from
-vehicles seen by both at one time, or that report their own position. Nothing here reads a clock.
+The odometry of each vehicle has its own frame. The transform between two frames is estimated from
+vehicles that are seen in both frames at one time, or that report their own position. No function
+reads a clock.
 """

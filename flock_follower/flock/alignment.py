@@ -15,16 +15,16 @@
 """
 Alignment of the odometry frame of another vehicle with the ego frame, by a Kalman filter.
 
-All frames share the vertical, by gravity: a frame has a yaw and a translation, 4 unknowns. The
-state is the yaw, which turns its coordinates to the ego ones, and the place of an anchor point in
-the ego frame. The anchor moves with the sending vehicle, because the drift of its odometry turns
-the frame about the vehicle. So the errors of yaw and place are nearly independent, and the lever
-arm is short.
+All frames have the same vertical axis, so a frame has 4 unknowns: yaw and translation. The state
+is the yaw, which rotates coordinates of the other frame to the ego frame, and the place of an
+anchor point in the ego frame. The anchor moves with the sending vehicle, because the drift of its
+odometry rotates the frame about the vehicle. So the errors of yaw and place are nearly
+independent, and the lever arm is short.
 
-The first estimate is a least-squares fit of the positions of common vehicles in two frames. The
-best yaw between two sets of points is the direction of a sum that is linear in cosine and sine,
-so that no initial value is needed; attitudes of a vehicle known in both frames add to that sum.
-The length of this sum of vectors is the information about the yaw; zero if all points coincide.
+The first estimate is a least-squares fit to the positions of vehicles that are known in both
+frames. The best yaw between two sets of points is the direction of a sum of vectors, so the fit
+needs no initial value; known attitudes of a vehicle in both frames add to this sum. The length of
+the sum is the information about the yaw, and zero if all points coincide.
 """
 
 from __future__ import annotations
@@ -73,10 +73,11 @@ def yaw_derivative(vector: Array) -> Array:
 @dataclass
 class Frame:
     """
-    Estimate of another vehicle's frame in the ego one; ``covariance`` (4, 4) of yaw and place.
+    Estimate of another vehicle's frame; ``covariance`` (4, 4) of yaw and place.
 
-    ``yaw``, rad, turns its coordinates to the ego ones; ``anchor`` (3,), m, in it is at ``place``
-    (3,), m, in the ego frame. ``stamp``, ns: of the newest drift.
+    ``yaw``, rad, rotates coordinates of the other frame to the ego frame. The point ``anchor``
+    (3,), m, of the other frame is at ``place`` (3,), m, in the ego frame. ``stamp``, ns, is the
+    time up to which drift was added.
     """
 
     yaw: float
@@ -92,7 +93,7 @@ class Frame:
         return math.sqrt(max(variances[1:].sum(), 0.0)), math.sqrt(max(variances[0], 0.0))
 
     def lever(self, position: Array) -> Array:
-        """Return the vector (3,), m, from the anchor to a position, turned to the ego frame."""
+        """Return the vector (3,), m, from the anchor to a position, along the ego frame's axes."""
         return yaw_rotation(self.yaw).dot(position - self.anchor)
 
     def locate(self, position: Array) -> tuple[Array, Array]:
@@ -134,9 +135,10 @@ class Frame:
 
     def relate(self, theirs: TrackPoint, ours: TrackPoint) -> float:
         """
-        Update with the track points of one vehicle in its frame and in the ego one, at one stamp.
+        Update with the track points of one vehicle in this frame and the ego frame, at one stamp.
 
-        Return their squared Mahalanobis distance divided by the gate's: above 1 it is refused.
+        Return their squared Mahalanobis distance divided by that of the gate; above 1 the points
+        are refused.
         """
         rotation, lever = yaw_rotation(self.yaw), self.lever(theirs.position)
         H, noise = _jacobian(lever), np.zeros((4, 4))
@@ -221,7 +223,7 @@ def in_own_frame(state: OdometryState, of_itself: bool, frame: Frame,
     """
     Return a state in an aligned frame as a state in the ego frame, at its stamp.
 
-    :param of_itself: whether the vehicle sent it of itself; :param name: of the ego frame.
+    :param of_itself: whether the sender is the vehicle itself; :param name: of the ego frame.
     """
     rotation, yaw_variance = yaw_rotation(frame.yaw), float(frame.covariance[0, 0])
     position, share = frame.locate(state.position)

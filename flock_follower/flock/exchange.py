@@ -19,14 +19,15 @@ Each follower sends its own state and the vehicles that it sees, in its own odom
 never what it received. Received states are transformed into the ego frame once the sender's frame
 is aligned; until then they are not used.
 
-The frame of a sender is related to the ego frame by a vehicle known in both at one time: the
-sender seen by this vehicle, this vehicle seen by the sender, or a vehicle that both see. If there
-is none, by a vehicle that another aligned sender reports. Such relations lead away from this
-vehicle: a sender related by n others relates only senders that are related by more.
+A relation between a sender's frame and the ego frame is a vehicle that is known in both frames at
+one time: the sender seen by this vehicle, this vehicle seen by the sender, or a vehicle that both
+see. If there is none, a vehicle that another aligned sender reports is the relation. Relations
+never form a circle: a sender that is related through n other senders helps to relate only senders
+that need more than n.
 
-Relations are collected until a first fit succeeds; later each updates the filter (``alignment``),
-and one that does not fit is refused. If the relations of a sender repeatedly do not fit, its frame
-has changed and is aligned again.
+Relations are collected until a first fit succeeds. Later each relation updates the filter
+(``alignment``), and a relation that does not fit is refused. If the relations of a sender
+repeatedly do not fit, its frame has changed, and is aligned again.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ RELATING = 200_000_000
 
 class Sharing:
     """
-    Messages of one follower to others, and theirs to it; times are ns.
+    The messages that one follower sends to other followers, and receives; times are ns.
 
     :param name: of this vehicle, unique in the flock.
     :raises ValueError: see ``checked_name``.
@@ -164,7 +165,7 @@ class Sharing:
         """
         Take a received message: a vehicle's state in the sender's frame ``NAME/odom``.
 
-        The order of messages that are received at the same time has no influence.
+        The order in which simultaneous messages are received has no influence.
         """
         if self._arrived and received != self._arrived[0][1]:
             self._settle()
@@ -313,7 +314,7 @@ class Sharing:
     # Out.
 
     def messages(self, now: int) -> list[OdometryState]:
-        """Return the messages to send: the ego state and sightings, each once, at most 10 Hz."""
+        """Return the messages to send: ego state and sightings, each once, at 10 Hz at most."""
         own, name = self._own, self.name
         if own is None or now - own.stamp > STALE_AGE or (
                 self._last_round is not None and 0 <= now - self._last_round < PERIOD):
@@ -335,9 +336,9 @@ class Sharing:
         """
         Return the received vehicles that are not seen, in the ego frame, one state per vehicle.
 
-        Each has the stamp of its state; the covariances are those of its prediction to ``now``. If
-        several states of one vehicle are known, the most certain one is used: their errors may be
-        correlated.
+        A state keeps its stamp; its covariances are those of its prediction to ``now``. If several
+        states of one vehicle are known, the state with the least uncertainty is used, not their
+        mean, because their errors may be correlated.
         """
         self._senders = {name: each for name, each in self.senders.items()
                          if now - each.received <= FORGOTTEN}

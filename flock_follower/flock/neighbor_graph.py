@@ -15,12 +15,12 @@
 """
 Neighbor graph of one vehicle: which neighbors share an edge with it, and the law on the edges.
 
-An edge joins two vehicles if no third one is nearer to both than they are to each other: the
-relative neighborhood graph (Toussaint, Pattern Recognition 12, 1980). This graph contains the
-minimum spanning tree, so it is connected. Both ends compute the same edge if they know the same
-positions. The graph has few edges, each about as long as the spacing of the flock. An edge is
-removed only if a third vehicle is nearer to both ends by HELD_FACTOR: every graph in between
-is connected as well.
+Two vehicles share an edge if no third vehicle is nearer to both than the two are to each other
+(relative neighborhood graph: Toussaint, Pattern Recognition 12, 1980). This graph contains the
+minimum spanning tree, so it is connected. Both vehicles compute the same edge if they know the
+same positions. The graph has few edges, each about as long as the spacing of the flock. An
+existing edge is removed only if a third vehicle is nearer to both ends by HELD_FACTOR; the graph
+with such additional edges is connected, too.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     :param positions: of the neighbors (m, 3), m.
     :param radii: sum of the radii of each neighbor and this vehicle (m,), m.
     :param own_radius: of this vehicle, m.
-    :param held: (m,) which shared an edge before.
+    :param held: (m,) whether a neighbor shared an edge in the step before.
     """
     own = np.maximum(_lengths(positions - position) - radii, 0.0)
     between = radii[:, None] + radii - 2.0 * own_radius
@@ -67,15 +67,16 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     """
     Return the acceleration (n,), m/s^2, of one agent of a flock.
 
-    Along an edge alignment, separation and cohesion act, with the L of the neighbors and this
-    agent. Any other neighbor only separates, with f0 psi. The pull of an edge, infinite from d1
-    on, is at most ``most``, so that an edge longer than the band does not mask the others.
+    Along an edge alignment, separation and cohesion act; L is that of this agent and its
+    neighbors. A neighbor without an edge causes only separation, f0 psi. The cohesion of one edge,
+    which would be infinite from d1 on, is at most ``most``: an edge longer than the band does not
+    outweigh all others.
 
     :param offsets: the neighbors' positions minus the ego one (m, n), m.
     :param differences: their velocities minus the ego one (m, n), m/s.
-    :param share: (m,) 1 along an edge, 0 without one, in between while an edge changes.
-    :param others: (m,) not part of the flock: separation with the L of the pair.
-    :param most: largest pull of one neighbor, m/s^2.
+    :param share: (m,) 1 with an edge, 0 without an edge, in between while an edge fades in or out.
+    :param others: (m,) whether a neighbor is not in the flock: separation with the L of the pair.
+    :param most: largest cohesion with one neighbor, m/s^2.
     """
     r2 = (offsets ** 2).sum(axis=1, keepdims=True)
     flock = np.concatenate([np.zeros_like(differences[:1]), differences[~others]])
@@ -89,7 +90,7 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
 
 
 def fade(r2: Array, params: FlockingParams) -> Array:
-    """Return psi, from 1 up to d0 + 0.28 (d1 - d0) to 0 from d1 on, at r2 in m^2."""
+    """Return psi at r2, m^2: 1 up to d0 + 0.28 (d1 - d0), then falling to 0 at d1."""
     begin = params.d0 + _FADE * (params.d1 - params.d0)
     y = ((r2 - begin) / (params.d1 - begin)).clip(0.0, 1.0) - 0.5
     square, sine = y * y, np.full_like(y, _SINE[-1])
@@ -100,7 +101,7 @@ def fade(r2: Array, params: FlockingParams) -> Array:
 
 
 def pair_disagreement(differences: Array) -> Array:
-    """Return the L, m/s, of each pair by itself, from its v_j - v_i (..., n)."""
+    """Return L, m/s, of each single pair of agents, from v_j - v_i (..., n)."""
     return np.linalg.norm(differences, axis=-1, keepdims=True) / np.sqrt(2.0)
 
 

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-States that vehicles send: names, validity, tracks of vehicles, leaps of odometry, prediction.
+States that vehicles send: names, validity, tracks, jumps of odometry, prediction.
 
-If a message is received before its stamp, the sender's clock is ahead by at least this difference.
-A clock that is behind has the same effect as a slow link.
+If a message arrives before the time of its stamp, the sender's clock is ahead by at least the
+difference. A clock that is behind has the same effect as a slow link.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def checked_name(name: str) -> str:
     """
     Return a vehicle's name.
 
-    :raises ValueError: if it cannot be the name of a vehicle.
+    :raises ValueError: if the name is not valid for a vehicle.
     """
     if not NAME.fullmatch(name):
         raise ValueError(f'vehicle_name = {name!r}: must be 1 to 64 letters, digits, _ . '
@@ -65,13 +65,13 @@ def sender_of(frame: str) -> str:
 
 
 def too_fast(state: OdometryState) -> str:
-    """Return the speed of a state that is faster than any vehicle, else ''."""
+    """Return the speed of a state as text if it is faster than any vehicle, else ''."""
     speed = math.hypot(*state.velocity.tolist())
     return '' if speed <= FASTEST else f'{state.child}: {speed:.3g} m/s'  # NaN is too fast
 
 
 def is_covariance(matrix: Array) -> bool:
-    """Return whether a matrix (3, 3) is a valid and useful covariance."""
+    """Return whether a matrix (3, 3) is a valid covariance, and not too large."""
     variances = matrix.diagonal()
     # NaN, zeros and -1 are not known; written so that NaN fails.
     if not (np.all(variances > 0.0) and np.all(variances <= VAGUE)):
@@ -100,7 +100,7 @@ def refusal(state: OdometryState, received: int) -> tuple[str, str] | None:
 
 
 def rank(state: OdometryState) -> tuple[object, ...]:
-    """Return a key of a message that is equal only for equal ones."""
+    """Return a key of a message, equal only for equal messages."""
     arrays = (state.position, state.quaternion, state.velocity, state.angular_velocity,
               state.pose_covariance, state.twist_covariance, state.twist_rotation)
     return (state.frame, state.child != sender_of(state.frame), state.stamp, state.child,
@@ -111,7 +111,7 @@ Kept = TypeVar('Kept')
 
 
 def in_order(by_name: dict[str, Kept]) -> list[Kept]:
-    """Return values in the order of their names, independent of the order of their arrival."""
+    """Return values sorted by name, independent of the order of their arrival."""
     return [by_name[name] for name in sorted(by_name)]
 
 
@@ -125,10 +125,10 @@ PREDICTION_TIME = 3.0  # s after its last message without which no prediction is
 
 def leapt(before: OdometryState, now: OdometryState) -> str:
     """
-    Return the leap of an odometry between two of its states, as text, or ''.
+    Return the jump of an odometry between two of its states, as text, or ''.
 
-    States of other vehicles come seconds apart, so the tolerance allows for their motion in
-    between. A leap of the yaw alone turns the frames against each other, too.
+    States of other vehicles may be seconds apart, so the tolerance allows for the motion between
+    two states. A jump of the yaw alone also rotates the frames against each other.
     """
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
     if not 0.0 <= elapsed <= PREDICTION_TIME:
@@ -142,7 +142,7 @@ def leapt(before: OdometryState, now: OdometryState) -> str:
 
 class TrackPoint(NamedTuple):
     """
-    A vehicle at one time, in some frame.
+    A vehicle at one time, in a given frame.
 
     ``stamp`` ns; ``position`` (3,), m, with ``covariance`` (3, 3); ``velocity`` (3,), m/s;
     ``yaw``, rad, with its variance, infinite if the yaw is unknown.
@@ -160,8 +160,9 @@ def position_covariance(state: OdometryState, of_itself: bool) -> Array:
     """
     Return the covariance (3, 3) of a position within the frame of its sender.
 
-    The drift of the sender's odometry belongs to its frame: its own position (``of_itself``) has
-    a small covariance, whatever its odometry reports. A sighting keeps its covariance.
+    The drift of the sender's odometry is an error of the sender's frame. So the sender's own
+    position (``of_itself``) has a small covariance in this frame, whatever its odometry reports. A
+    sighting keeps its covariance.
     """
     noise = ODOMETRY_NOISE if of_itself else SIGHTING_NOISE
     covariance: Array = np.zeros((3, 3)) if of_itself else state.pose_covariance[:3, :3]
@@ -196,7 +197,7 @@ class Track:
         self._points: list[TrackPoint] = []
 
     def add(self, point: TrackPoint) -> None:
-        """Add the newest point; one too soon after another replaces it."""
+        """Add the newest point; if too soon after the last point, in its place."""
         points = self._points
         if points and point.stamp <= points[-1].stamp:
             points.clear()  # time has jumped back: the caller has checked that
@@ -207,7 +208,7 @@ class Track:
             del points[:self._first_index(point.stamp - HORIZON // 2)]
 
     def point_at(self, stamp: int) -> TrackPoint | None:
-        """Return the vehicle at a stamp, ns, or None if that is unknown."""
+        """Return the vehicle at a stamp, ns; None if the track does not cover the stamp."""
         k = self._first_index(stamp)
         if k == len(self._points):
             if not k or stamp - self._points[-1].stamp > REACH:

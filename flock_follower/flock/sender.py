@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A vehicle that sends messages: its messages, and the relation of its frame to the ego frame."""
+"""A vehicle that sends messages: its states, and the relation of its frame to the ego frame."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Sender:
     """Until when, ns, and why it is ignored."""
 
     def sent_at(self, stamp: int, received: int) -> None:
-        """Note the stamp of the sender's own state; a sender that sends too often is ignored."""
+        """Record the stamp of the sender's own state; ignore a sender that sends too often."""
         self.sent.append(stamp)
         if len(self.sent) == BURST_COUNT and stamp - self.sent[0] < BURST_TIME:
             self.ban = received + BAN_TIME, f'sends {BURST_COUNT} times in {BURST_TIME / 1e9:g} s'

@@ -13,9 +13,8 @@
 # limitations under the License.
 
 """
-The gate decides which setpoints may be sent, independent of the commands.
+The gate decides which setpoints may be sent, whatever the planner commands.
 
-ENU; it knows nothing of MAVLink.
-
-The planner is imported for its limits, which the gate applies again.
+All vectors are ENU; nothing here depends on MAVLink. The gate imports the planner's limits, and
+applies these limits again.
 """

@@ -17,14 +17,14 @@ The disturbance: acceleration that was not commanded, from a wrong hover thrust 
 
 An autopilot flies an acceleration setpoint by a tilt and a thrust that depend on the setpoint
 alone. PX4 does not compare the result with the setpoint: in wind the vehicle drifts, and with a
-wrong hover thrust it sinks or climbs. ArduPilot closes these loops itself; there the estimate
-stays small. The gate alone offsets the disturbance, beside the command.
+wrong hover thrust it sinks or climbs. ArduPilot compensates wind and thrust itself, so its
+disturbance stays small. Only the gate offsets the disturbance; the planner's command does not
+contain the offset.
 
 ``DisturbanceObserver`` is a Luenberger observer with the states velocity and disturbance, both
-poles of an axis at -w (BANDWIDTH): v' = response + d + 2 w (v_measured - v),
-d' = w^2 (v_measured - v).
-``HeightWatch`` detects a height that departs from the commanded height, independent of the
-estimate.
+poles of an axis at -w (BANDWIDTH): v' = response + d + 2 w (v_measured - v), d' = w^2 (v_measured
+- v). ``HeightWatch`` detects that the height departs from the commanded height, without the
+  estimate.
 """
 
 from __future__ import annotations
@@ -92,9 +92,9 @@ class DisturbanceObserver:
         """
         Update the estimate to ``now``, s.
 
-        :param sent: acceleration (3,), m/s^2, flown since the last step; None: none of ours, which
-            resets the estimate.
-        :param velocity: measured (3,), m/s; None without one: the estimate stays.
+        :param sent: acceleration (3,), m/s^2, flown since the last step; None if the vehicle did
+            not fly our setpoints: this resets the estimate.
+        :param velocity: measured (3,), m/s; None if unknown: the estimate does not change.
         """
         elapsed, self._time = now - self._time, now
         if sent is None:
@@ -134,7 +134,7 @@ HEIGHT_LEFT: Final[float] = 0.2
 
 
 class HeightWatch:
-    """Detects a height that departs from the commanded height: an unestimated thrust error."""
+    """Detects that the height departs from the commanded height, by an unknown thrust error."""
 
     def __init__(self) -> None:
         self.reason = ''
@@ -143,9 +143,9 @@ class HeightWatch:
 
     def step(self, height: float | None, commanded: float | None) -> None:
         """
-        Compare the height with the commanded one, m; None if either is unknown.
+        Compare the height with the commanded height, m; None if one of them is unknown.
 
-        If the commanded height moves away from the vehicle, the difference does not count.
+        A difference that grows because the commanded height moves away does not count.
         """
         self.reason = ''
         if height is None or commanded is None or not math.isfinite(height - commanded):

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The limits of the gate, and the safety envelope: heights and a radius that setpoints stay within.
+The limits of the gate, and the safety envelope: setpoints stay within heights and a radius.
 
 Each bound limits the acceleration towards it, so that the vehicle can still stop in front of it. A
 vehicle beyond a bound is handed to the autopilot's hold mode. Vectors are ENU.
@@ -56,7 +56,7 @@ MIN_VELOCITY_TOLERANCE: Final[float] = 0.4
 
 @dataclass(frozen=True)
 class GateLimits(Checked):
-    """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
+    """Limits and timeouts of the gate; a ValueError names parameter, value and valid range."""
 
     a_max: float = parameter(
         2.5, A_MAX, 'largest magnitude of the acceleration', live=True)
@@ -162,8 +162,9 @@ def vertical_range(limits: GateLimits, place: Location, climb_rate: float, horiz
     """
     Return the least and greatest vertical acceleration, m/s^2, that the height bounds permit.
 
-    :param climb_rate: by the odometry, m/s: the rate that is worse for a bound counts.
-    :param horizon: time in which the speed is to be reached, s.
+    :param climb_rate: by the odometry, m/s; each bound takes the worse of this rate and the
+        sensor's.
+    :param horizon: time in which the speed is reached, s.
     :param a_max: largest magnitude of the acceleration, m/s^2.
     """
     if place.height is None or not math.isfinite(place.height + place.climb_rate):
@@ -208,7 +209,7 @@ def find_exceeded_bound(limits: GateLimits, place: Location, tolerance: float = 
 
 
 def refuse_height(limits: GateLimits, height: float | None) -> str:
-    """Return why a vehicle of a height, m, may not fly our setpoints, or ''."""
+    """Return why a vehicle at a height, m, may not fly our setpoints, or ''."""
     if height is None:
         return ('the height above the place of arming is not known: neither barometer '
                 '(SCALED_PRESSURE) nor rangefinder (DISTANCE_SENSOR), or armed before the bridge '
@@ -248,7 +249,7 @@ _EXPONENT: Final[float] = 0.190263
 
 
 def pressure_altitude(pressure: float) -> float:
-    """Return the altitude, m, at which the standard atmosphere has a pressure, hPa; or NaN."""
+    """Return the altitude, m, of a pressure, hPa, in the standard atmosphere; or NaN."""
     if not 0.0 < pressure < 2000.0:
         return math.nan
     return _ZERO_PRESSURE_ALTITUDE * (1.0 - (pressure / SEA_LEVEL_PRESSURE) ** _EXPONENT)
@@ -279,7 +280,7 @@ class HeightEstimator:
         """
         Take an altitude of a sensor, m; return '' or the reason why it is refused.
 
-        :param climb_rate: of the vehicle, m/s, by another source; None if none is known.
+        :param climb_rate: of the vehicle, m/s, by another source; None if unknown.
         :param sensor: its name.
         """
         elapsed = now - self._time
@@ -370,13 +371,13 @@ class HeightEstimator:
         return self._reference is not None
 
     def refer(self, height: float | None, now: float) -> None:
-        """Set the reference so that the present height is the given one, m; None forgets it."""
+        """Set the reference so that the present height is a given height, m; None forgets it."""
         altitude = self.altitude(now)
         self._reference = None if height is None or altitude is None else altitude - height
         self._referred = self.has_reference
 
     def is_missing(self, now: float) -> bool:
-        """Return whether the height was known before and is not received any more."""
+        """Return whether the height was known before, but is not received any more."""
         return self._referred and self.height(now) is None
 
     def obstacle(self, now: float) -> Obstacle | None:

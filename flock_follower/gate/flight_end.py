@@ -53,9 +53,9 @@ class CommandSources:
         """
         Take a command; return whether it shows that two publishers command.
 
-        A publisher that replaces a silent one does not count as a second.
+        A publisher that replaces a silent publisher does not count as a second one.
 
-        :param number: its sequence number, from 1; None if the middleware has none.
+        :param number: its sequence number, from 1; None if the middleware has no numbers.
         :param time: its time of arrival, s on a monotonic clock.
         """
         if number is None:
@@ -135,13 +135,13 @@ class FlightEnd:
         self._low_since = min(self._low_since, now) if low else math.inf
 
     def battery_low(self, now: float) -> str:
-        """Return the reason if the battery has been low for long enough, or ''."""
+        """Return the reason to end the flight if the battery has been low for a time, or ''."""
         return '' if now - self._low_since < BATTERY_TIME else (
             f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
             f'{100.0 * self.params.battery_low:.0f} %')
 
     def battery_unknown(self, now: float) -> bool:
-        """Return whether the battery is unknown, so that ``battery_low`` cannot act."""
+        """Return whether the battery is unknown; then ``battery_low`` cannot end a flight."""
         remaining, time = self._battery
         return self.params.battery_low > 0.0 and (
             math.isnan(remaining) or now - time > BATTERY_TIMEOUT)
@@ -158,7 +158,7 @@ class FlightEnd:
     def reason(self, active_since: float, command_time: float, handover: str,
                now: float) -> Handover:
         """
-        Return whether, and why, a vehicle that flies our setpoints must be handed over.
+        Return whether a vehicle that flies our setpoints must be handed over, and the reason.
 
         :param active_since: time from which it has been ACTIVE, s; infinite while it is not.
         :param command_time: time of the last accepted command, s.
@@ -181,8 +181,8 @@ class FlightEnd:
         Return the request to the autopilot at ``now``: HOLD, LAND or '' for none.
 
         :param flies: whether the vehicle, as far as known, flies our setpoints.
-        :param pending: whether a request that ends the flight is open.
-        :param handover: what ``reason`` requires now.
+        :param pending: whether a request that ends the flight has no answer yet.
+        :param handover: the present result of ``reason``.
         :param held_mode: the mode that the handover requested and reached, or ''.
         :param status: of the vehicle.
         """

@@ -77,7 +77,7 @@ class Commands:
 
 @dataclass
 class ReportedFlight:
-    """What the autopilot reports of the flight; a time is infinite while it does not hold."""
+    """The autopilot's report of the flight; a time is infinite while its condition is false."""
 
     status: VehicleStatus | None = None
     airborne: bool | None = None
@@ -99,7 +99,7 @@ class ReportedFlight:
 
 @dataclass
 class Flown:
-    """The last setpoint, and the values that braking holds; None: unknown, or none."""
+    """The last setpoint, and the yaw and height that braking holds; None if unknown."""
 
     acceleration: Array | None = None
     """(3,), m/s^2, if the vehicle flies it."""
@@ -117,12 +117,13 @@ class Gate:
     """
     Permission and setpoints of one follower.
 
-    Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message when it was
-    received, s, so that the gate needs no second clock.
+    Vectors are ENU. ``now`` is a monotonic clock, s. ``age`` is the age of a message when it was
+    received, s, so the gate needs no second clock.
 
-    :param limits: at start; ``limits`` may be lowered later, braking and separation keep these.
-    :param velocity_source: source of the velocity that commands are checked against; it must be
-        fresh: 'odom', 'autopilot', or 'auto', which is odom once odom was received.
+    :param limits: at the start; if ``limits`` are lowered later, braking and separation keep the
+        limits of the start.
+    :param velocity_source: source of the velocity with which commands are checked: 'odom',
+        'autopilot', or 'auto', which is odom once odom was received. The velocity must be fresh.
     """
 
     def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
@@ -142,7 +143,7 @@ class Gate:
         self._height_watch = HeightWatch()
 
     def permit(self, after: Permission) -> None:
-        """Take the permission after an event, such as ``permission.request(now)``."""
+        """Replace the permission by its next state, such as ``permission.request(now)``."""
         before, self.permission, phase = self.permission, after, after.phase
         self._flight.was_active = phase is Phase.ACTIVE or (
             self._flight.was_active and phase is Phase.GIVING_BACK)
@@ -167,7 +168,7 @@ class Gate:
 
     @property
     def active_since(self) -> float:
-        """Return the time from which it has been ACTIVE, s; infinite while it is not."""
+        """Return the time at which the permission became ACTIVE, s; infinite while it is not."""
         return self._flight.active_since
 
     @property
@@ -180,7 +181,8 @@ class Gate:
         """
         Take a command for the time ``now - age``; return '' or why it is refused.
 
-        ``source_age`` is the age of the image the command rests on, for latency statistics.
+        ``source_age`` is the age of the image on which the command is based, for latency
+        statistics.
         """
         a, phase = finite_vector(command.acceleration), self.permission.phase
         source = age if source_age is None else source_age
@@ -236,7 +238,7 @@ class Gate:
             time, now)
 
     def yaw_difference(self, now: float) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
+        """Return the yaw of odom minus that of the autopilot, rad; None if a yaw is not fresh."""
         return self.motion.known_motion(self.limits, now).turned
 
     def contradiction(self, now: float) -> str:
@@ -245,9 +247,9 @@ class Gate:
 
     @property
     def wind(self) -> float:
-        """Return the acceleration by the wind that setpoints offset, m/s^2."""
-        return float(np.linalg.norm(
-            self._disturbance.offset(self.autopilot.needs_wind_offset)[:2]))
+        """Return the acceleration by wind that the setpoints offset, m/s^2."""
+        offset = self._disturbance.offset(self.autopilot.needs_wind_offset)
+        return float(np.linalg.norm(offset[:2]))
 
     @property
     def thrust_offset(self) -> float:
@@ -255,7 +257,7 @@ class Gate:
         return float(self._disturbance.offset(False)[2])
 
     def thrust_error(self, now: float, longer: float = disturbance.WARNING_TIME) -> str:
-        """Return the reason if the thrust error has been too large for over a time, s, or ''."""
+        """Return the reason if the thrust error is too large for more than a time, s, or ''."""
         return '' if now - self._disturbance.excess_since <= longer else (
             f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
             f'more than setpoints offset ({THRUST_OFFSET_MAX:g}): check the load, the '
@@ -295,14 +297,14 @@ class Gate:
         """
         Return the setpoint to send at ``now``, s, and its command, if any.
 
-        Once the vehicle flies our setpoints, the yaw and height to hold are those at the beginning
-        of braking, and the radius counts from the position at ACTIVE. Before, these values follow
-        the vehicle.
+        While the vehicle flies our setpoints, braking holds the yaw and height at its beginning,
+        and the radius counts from the position at ACTIVE. Before that, these values follow the
+        vehicle.
 
-        :param link_age: time since the autopilot is missing, s.
-        :param withheld: a reason of the caller's own to send nothing.
+        :param link_age: for how long messages of the autopilot have been missing, s.
+        :param withheld: a reason of the caller to send nothing, or ''.
         :param distrusted: why the velocity of the autopilot is invalid, or ''.
-        :param mode_age: time since a message last had the mode, s.
+        :param mode_age: time since the last message with the mode, s.
         """
         self.commands.is_new = False
         self.permit(self.permission.follow_silence(mode_age))

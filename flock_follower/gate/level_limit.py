@@ -29,9 +29,9 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     """
     Return the acceleration (3,) within the limits; its vertical part has priority.
 
-    The vertical part is ``up``, m/s^2, or as near to it as both limits allow. The horizontal part
-    is the nearest one to that of ``a`` in the discs that this level cuts out of the limits and,
-    in their order, within bounds of the plane.
+    The vertical part is ``up``, m/s^2, or as near to it as both limits allow. With this vertical
+    part, each limit is a disc of horizontal accelerations. The horizontal part is the point of the
+    discs that is nearest to the horizontal part of ``a``, within the bounds in their order.
     """
     fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
     strongest, reach, center = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()

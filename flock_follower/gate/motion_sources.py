@@ -15,8 +15,8 @@
 """
 The vehicle's motion by odometry and by the autopilot, as the gate receives it.
 
-``MotionSources`` stores the newest motion of both, chooses the source that commands are checked
-against, and compares the two: see ``velocity_check``.
+``MotionSources`` stores the newest motion of both sources, chooses the source with which commands
+are checked, and compares the sources, see ``velocity_check``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 
 
 def onset(since: float, holds: bool, now: float) -> float:
-    """Return the time from which a condition holds, s; infinite while it does not."""
+    """Return the time since which a condition has been true, s; infinite while it is false."""
     return min(since, now) if holds else math.inf
 
 
@@ -61,8 +61,8 @@ class MotionSources:
     """
     The newest motion by both sources; times are monotonic, s.
 
-    :param choice: the source that commands are checked against, one of ``VELOCITY_SOURCES``;
-        'auto' is odom once odom was received.
+    :param choice: the source with which commands are checked, one of ``VELOCITY_SOURCES``; 'auto'
+        is odom once odom was received.
     """
 
     def __init__(self, choice: str) -> None:
@@ -78,7 +78,7 @@ class MotionSources:
 
     @property
     def source(self) -> str:
-        """Return the source that commands are checked against now."""
+        """Return the source with which commands are checked now."""
         if self._choice in (ODOM, AUTOPILOT):
             return self._choice
         # Once odometry was received, losing it must brake: the autopilot's own estimate often
@@ -132,7 +132,7 @@ class MotionSources:
 
     def take_position(self, source: str, position: ArrayLike, time: float,
                       max_age: float) -> None:
-        """Take a position (3,), m, at a time, s; ``max_age`` of a velocity to compare it, s."""
+        """Take a position (3,), m, at a time, s; see ``Source.take_position`` for ``max_age``."""
         self._sources[source].take_position(position, time, 0.0, max_age)
 
     def take_yaw(self, source: str, yaw: float, time: float) -> None:
@@ -144,16 +144,16 @@ class MotionSources:
         self._height_path.take(np.array([0.0, 0.0, height]), None, now)
 
     def forget_heights(self) -> None:
-        """Begin the heights anew: the sensor has jumped."""
+        """Forget the heights, because the sensor has jumped."""
         self._height_path = Path()
 
     def fresh_yaw(self, max_age: float, now: float) -> float | None:
-        """Return the autopilot's yaw, rad, or odom's if the autopilot's is not fresh, or None."""
+        """Return the autopilot's yaw, rad; if it is not fresh, odom's yaw, or None."""
         yaws = (self._sources[source].yaw() for source in (AUTOPILOT, ODOM))
         return next((yaw for yaw, time in yaws if now - time <= max_age), None)
 
     def best_velocity(self, limits: GateLimits, now: float) -> Velocity | None:
-        """Return the velocity by the source, else the velocity to brake with, else None."""
+        """Return the velocity by the chosen source, else the velocity for braking, else None."""
         by_source = self._sources[self.source].motion(now).fresh_velocity(limits)
         return by_source or self.known_motion(limits, now).braking
 
@@ -172,9 +172,9 @@ class MotionSources:
         """
         Compare the velocities and displacements; return the known motion.
 
-        :param engaged: whether the vehicle flies by them.
+        :param engaged: whether the vehicle flies with these velocities.
         :param distrusted: whether the velocity of the autopilot is invalid.
-        :param fused: whether the autopilot's estimate rests on our odometry.
+        :param fused: whether the autopilot's estimate uses our odometry.
         """
         self._distrusted_since = onset(self._distrusted_since, distrusted, now)
         known, before = self.known_motion(limits, now), self._comparison.disagreeing_for(now)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The reason against a command: a value for comparisons in code, and a text for people."""
+"""Why a command is refused: a value for comparisons in code, and a text for people."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 
 class Obstacle(enum.Enum):
-    """Reason against sending a command; the value is the text if ``Refusal`` has no detail."""
+    """Reason not to send a command; its value is the text of a ``Refusal`` without details."""
 
     WITHHELD = 'not permitted'
     DISARMED = 'disarmed'

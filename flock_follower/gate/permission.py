@@ -27,7 +27,7 @@ GIVING_BACK  braking setpoints                   READY
 TAKEN_OVER   nothing                             TAKEN_OVER
 ===========  ==================================  ================================================
 
-Whatever the phase, NO_AUTOPILOT is announced while no autopilot is connected; the phase does not
+While no autopilot is connected, NO_AUTOPILOT is announced in every phase; the phase does not
 change, because the vehicle may still fly our setpoints. ``docs/fly.md`` has a diagram.
 """
 
@@ -132,7 +132,7 @@ class Permission:
         return self.streams and self.obeyed
 
     def taken_over(self, now: float) -> str:
-        """Return the refusal if a pilot took over too shortly before ``now``, s, or ''."""
+        """Return the refusal if a pilot took over shortly before ``now``, s, or ''."""
         taken = self.phase is Phase.TAKEN_OVER or self.taker == STICK
         if not taken or not self.taker.pilot or now - self.received >= TAKEOVER_TIME:
             return ''
@@ -147,7 +147,7 @@ class Permission:
     # The permission after an event.
 
     def request(self, time: float) -> Permission:
-        """Permit setpoints for a request of offboard at a time, s."""
+        """Permit setpoints after a request of ``offboard`` at a time, s."""
         return self if self.phase is Phase.ACTIVE else Permission(
             Phase.READY, 'waiting for offboard mode', time, cause=Cause.WAITING)
 
@@ -184,13 +184,13 @@ class Permission:
                           received=self.received, obeyed=unseen, cause=cause, taker=self.taker)
 
     def contest(self, who: str) -> Permission:
-        """Brake, because two nodes give commands at once."""
+        """Brake, because two nodes publish commands."""
         return self if self.phase is not Phase.ACTIVE else self._giving_back(
             f'two nodes command: {who}', Cause.CONTESTED)
 
     def fall_silent(self, why: str, mode_age: float = 0.0) -> Permission:
         """
-        Stop sending, as no velocity is valid: only silence starts the failsafe.
+        Stop sending, because no velocity is valid; the autopilot's failsafe then starts.
 
         :param mode_age: time since a message last had the mode, s.
         """
@@ -200,7 +200,7 @@ class Permission:
             f'fell silent: {why}', Cause.SILENT, unseen)
 
     def follow_silence(self, silence: float) -> Permission:
-        """Brake until offboard is requested, after a time, s, without a report of the mode."""
+        """Brake until offboard is requested again: no mode was reported for a time, s."""
         flown = self.phase in (Phase.READY, Phase.ACTIVE) and self.obeyed
         return self if not flown or silence <= LONGEST_SILENCE else self._giving_back(
             f'mode unknown for {silence:.0f} s, the pilot may have taken over',
@@ -211,7 +211,7 @@ class Permission:
         return self._stop_sending(ON_GROUND, Cause.LANDED) if self.streams else self
 
     def reset(self, why: str) -> Permission:
-        """Reset: the autopilot, rebooted or replaced, has not received the request."""
+        """Reset: a rebooted or replaced autopilot has not received the request."""
         return Permission(reason=why, cause=Cause.RESTARTED)
 
     def leave_mode(self, status: VehicleStatus, taker: Taker = UNKNOWN) -> Permission:
@@ -233,7 +233,7 @@ class Permission:
         Follow a HEARTBEAT or CURRENT_MODE that was received at the time ``received``, s.
 
         :param airborne: whether the vehicle reports that it flies: on the ground setpoints could
-            start a take-off. None: it does not report, which permits nothing.
+            start a take-off. None: no report, so nothing is permitted.
         """
         if not (self.streams or self.obeyed) or received <= self.since:
             return self

@@ -15,14 +15,14 @@
 """
 Flight without odometry: when it is permitted, and the motion by attitude and acceleration.
 
-It begins while the vehicle flies our commands, if the odometry that they were flown on is lost or
-contradicted, and ends once odometry has been usable again for USABLE_TIME, after
-``relative_timeout``, or with the permission. After a takeover, too, it begins only once commands
-were flown on odometry. Time flown without odometry counts until as much was flown with it.
+The flight without odometry begins if odometry is lost or contradicted while the vehicle flies
+commands that use it; so after a takeover it begins only after commands with odometry. It ends
+when odometry has been usable for USABLE_TIME, after ``relative_timeout``, or with the permission.
+The time flown without odometry is counted; the same time flown with odometry resets the count.
 
-The motion (``Reckoning``) integrates the acceleration that the attitude leads to. Its velocity
-drifts, so it leaks; the marker's relative motion does not depend on that. Vectors are ENU; time
-is an argument.
+``Reckoning`` integrates the acceleration that follows from the attitude. The integrated velocity
+drifts, so it decays slowly to zero; the relative motion of the marker does not depend on it.
+Vectors are ENU; time is an argument.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _UNKNOWN: Final[Array] = np.zeros((6, 6))
 
 
 class Relative(NamedTuple):
-    """The permission for commands that are based on the marker alone."""
+    """The permission for commands that are based on the marker only."""
 
     lasted: float = math.nan
     """Time flown without odometry, s; NaN: not permitted now."""
@@ -59,7 +59,7 @@ class Relative(NamedTuple):
 
 
 class Reckoning:
-    """Position and velocity (3,), m and m/s, since its beginning."""
+    """Position (3,), m, and velocity (3,), m/s, integrated since the beginning."""
 
     def __init__(self, height: float) -> None:
         self.position: Array = np.array([0.0, 0.0, height])
@@ -72,8 +72,8 @@ class Reckoning:
         Integrate up to a time, s.
 
         :param rotation: attitude (3, 3), FLU to ENU.
-        :param acceleration: (3,), m/s^2: vertically the flown one; horizontally the part that the
-            attitude does not show, such as wind.
+        :param acceleration: (3,), m/s^2; vertical: the flown acceleration; horizontal: the part
+            that does not follow from the attitude, such as wind.
         :param height: by barometer or rangefinder, m.
         """
         elapsed = 0.0 if self._time is None else time - self._time
@@ -94,9 +94,9 @@ class Reckoning:
 
 class RelativeFlight:
     """
-    Whether commands without odometry are admitted; times are monotonic, s.
+    Permits commands without odometry; times are monotonic, s.
 
-    :param timeout: longest time for which they are admitted, s; 0: never.
+    :param timeout: longest time for which they are permitted, s; 0: never.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -127,7 +127,7 @@ class RelativeFlight:
 
         :param active: whether the vehicle flies our setpoints by permission.
         :param commanded: whether the last setpoint was a command.
-        :param usable: whether odometry may be flown on.
+        :param usable: whether odometry may be used.
         :param height: by barometer or rangefinder, m; without a height the flight without odometry
             does not begin.
         """

@@ -15,17 +15,18 @@
 """
 The setpoint rules: one pure function decides which setpoint may be sent now, if any.
 
-A command passes only if it is fresh and finite, the velocity that it is checked against is fresh,
-and the autopilot is received. A command that rests on the marker alone passes only while flight
-without odometry is permitted (``relative_flight``), and with bounds of its own, because its speed
-is not known. Otherwise the setpoint brakes. A stale command is never repeated: an
-autopilot keeps accelerating for seconds when its setpoints stop, none limits the speed that
-acceleration setpoints lead to, and ArduCopter obeys NaN. Each command keeps these bounds, the
-most important first: ``a_max`` and ``v_max``; the heights of the envelope; the separation that the
-planner requests; the radius of the envelope; the rest of the command. The setpoint is that command
-plus the offset of the disturbance (``disturbance``), which does not move the vehicle: ``v_max``
-and the envelope bound the command alone, ``a_max`` bounds the sum. Vectors are ENU; ``decide``
-takes everything that it depends on as one ``Situation``.
+A command passes under three conditions: it is fresh and finite, the velocity with which it is
+checked is fresh, and the autopilot is received. A command that is based on the marker only passes
+while flight without odometry is permitted (``relative_flight``), and has other bounds, because the
+speed is not known. Otherwise the setpoint brakes. An old command is never repeated, because an
+autopilot continues to accelerate for seconds after the last setpoint, does not limit the speed
+that results from acceleration setpoints, and (ArduCopter) obeys NaN.
+
+Each command keeps these bounds, the most important first: ``a_max`` and ``v_max``; the heights of
+the envelope; the separation that the planner requests; the radius of the envelope; the rest of the
+command. The setpoint is this command plus the offset of the disturbance (``disturbance``). The
+offset does not move the vehicle, so ``v_max`` and the envelope limit the command only; ``a_max``
+limits the sum. Vectors are ENU. All inputs of ``decide`` are in one ``Situation``.
 """
 
 from __future__ import annotations
@@ -98,9 +99,9 @@ def decide(situation: Situation) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
-    Whatever the situation holds (NaN, infinities, wrong shapes, ages in the future), the
-    acceleration is finite, at most ``a_max`` long, and does not point upwards on the ground;
-    without the offset it never leads to a speed above ``v_max``.
+    For every situation (NaN, infinities, wrong shapes, ages in the future) the acceleration is
+    finite, at most ``a_max``, and does not point upwards on the ground. Without the offset, the
+    acceleration never leads to a speed above ``v_max``.
     """
     known, place, held = situation.known, situation.place, situation.held
     yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None

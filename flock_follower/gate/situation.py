@@ -15,8 +15,9 @@
 """
 The situation of one decision: all inputs of ``setpoint_rules.decide`` as one value.
 
-The gate collects its inputs into a ``Situation``, and ``decide`` turns it into a setpoint.
-``to_json`` writes it as one line; ``read_situation`` reads it: a decision can be made again.
+The gate collects its inputs in a ``Situation``; ``decide`` returns the setpoint for it.
+``to_json`` writes a situation as one line, ``read_situation`` reads the line, so a decision can
+be repeated.
 """
 
 from __future__ import annotations
@@ -101,12 +102,12 @@ class Situation:
 
     @property
     def command_age(self) -> float:
-        """Return the time since the command applied, s; infinite without one."""
+        """Return the time since the command became valid, s; infinite without a command."""
         return math.inf if self.command is None else self.now - self.command.time
 
     @property
     def source_age(self) -> float:
-        """Return the age of the image that the command rests on, s; infinite without one."""
+        """Return the age of the image on which the command is based, s; infinite without one."""
         return math.inf if self.command is None else self.now - self.command.source_time
 
     def to_json(self) -> str:

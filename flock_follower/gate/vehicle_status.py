@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 
 class VehicleStatus(NamedTuple):
-    """The vehicle's state by HEARTBEAT, or by a CURRENT_MODE after it."""
+    """The vehicle's state by the newest HEARTBEAT or CURRENT_MODE."""
 
     armed: bool
     mode: str

@@ -20,9 +20,9 @@ a wrong velocity accelerates the vehicle. Three comparisons find a contradiction
 
 - yaws: whether the frames of both sources are rotated against each other;
 - velocities, averaged over AVERAGING_TIME: if they differ, neither source is known to be right;
-- displacements over the last DISPLACEMENT_WINDOW seconds: a small velocity error shows in time.
-  A position jump that the source's own velocity does not explain is removed, because estimators
-  correct themselves in jumps.
+- displacements over the last DISPLACEMENT_WINDOW seconds, which reveal small velocity errors. A
+  position jump that does not agree with the source's velocity is removed from the displacement,
+  because estimators correct their position in jumps.
 
 Vectors are ENU. Time is an argument; no clock is read.
 """
@@ -214,7 +214,7 @@ LATCH_TIME: Final[float] = 0.6
 
 
 class VelocityComparison:
-    """Averages the difference of two velocities, and measures how long it has been too large."""
+    """Averages the difference of two velocities, and measures for how long it is too large."""
 
     def __init__(self) -> None:
         self._average: Array = np.zeros(3)
@@ -225,9 +225,9 @@ class VelocityComparison:
         """
         Take the velocity of odom minus that of the autopilot (3,), m/s, at ``now``, s.
 
-        :param difference: None if one of them is not fresh.
+        :param difference: None if one of the velocities is not fresh.
         :param tolerance: largest average difference, m/s.
-        :param flying: whether the vehicle flies by them; else nothing is stored.
+        :param flying: whether the vehicle flies with these velocities; else nothing is stored.
         """
         if difference is not None:
             first = math.isinf(self._time)
@@ -248,7 +248,7 @@ class VelocityComparison:
         return math.sqrt(self._average.dot(self._average))
 
     def disagreeing_for(self, now: float) -> float:
-        """Return the time since they began to disagree, s; minus infinity if they agree."""
+        """Return for how long the velocities disagree, s; minus infinity if they agree."""
         return now - self._since
 
 
@@ -277,8 +277,9 @@ class Path:
     """
     The positions (3,), m, of one source, without jumps; times are monotonic, s.
 
-    Jumps are judged here by one rule for both sources: the autopilot's position counts none. They
-    are taken out of the path instead of counted: displacements must not contain them.
+    One rule here removes the jumps of both sources from the path, because displacements must not
+    contain jumps. The counter of the odometry's jumps is not used, because the autopilot's
+    position has none.
     """
 
     def __init__(self) -> None:
@@ -356,7 +357,7 @@ def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     Return the recent displacement (3,) of ``one`` minus that of ``other``, m.
 
     :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
-    :returns: zeros if they do not overlap, or one of them is not recent.
+    :returns: zeros if the paths do not overlap, or one is not recent.
     """
     (first, last), (other_first, other_last) = one.span, other.span
     start, end = max(first, other_first, now - DISPLACEMENT_WINDOW), min(last, other_last)
@@ -387,7 +388,7 @@ class Source:
         """Standard deviation of the position, m."""
 
     def take_velocity(self, velocity: Array, time: float) -> None:
-        """Take a velocity (3,), m/s, at a time, s; one that comes late replaces no newer one."""
+        """Take a velocity (3,), m/s, at a time, s; a late velocity replaces no newer velocity."""
         if time >= self.velocity_time:
             self.velocity, self.velocity_time = velocity, time
 
@@ -407,7 +408,7 @@ class Source:
             self.std = std if math.isfinite(std) else 0.0
 
     def take_yaw(self, yaw: float, time: float) -> None:
-        """Take a yaw, rad, at a time, s; it replaces one of the same time."""
+        """Take a yaw, rad, at a time, s; it replaces a yaw of the same time."""
         newest = self.yaws[-1][0] if self.yaws else -math.inf
         if not math.isfinite(yaw) or not time >= newest:
             return
@@ -419,7 +420,7 @@ class Source:
                 self.yaws.popleft()
 
     def yaw(self, time: float = math.inf) -> tuple[float, float]:
-        """Return the yaw nearest to a time, s, in rad, and its own time; by default the newest."""
+        """Return the yaw, rad, nearest to a time, s, and its own time; by default the newest."""
         newest_time, newest = self.yaws[-1] if self.yaws else (-math.inf, 0.0)
         if not newest_time > time:
             return newest, newest_time
@@ -429,7 +430,7 @@ class Source:
         return min(reversed(near), key=lambda known: abs(known[0] - time))[::-1]
 
     def motion(self, now: float, at: float = math.inf) -> SourceMotion:
-        """Return the newest motion at ``now``, s, with the yaw nearest to a time, s."""
+        """Return the newest motion at ``now``, s, with the yaw that is nearest to a time, s."""
         yaw, _ = self.yaw(at)
         return SourceMotion(self.velocity, now - self.velocity_time, yaw, now - self.yaw()[1])
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How to talk to the autopilot: transport, link, telemetry, dialects, commands, requests, texts.
+MAVLink to the autopilot: transport, link, telemetry, dialects, commands, requests, texts.
 
 NED and pymavlink exist only here. The gate (``flock_follower.gate``) decides what may be sent.
 """

@@ -15,7 +15,7 @@
 """
 The bridge without ROS: inputs, one cycle of the control loop, outputs.
 
-One thread owns it, see ``setpoint_thread``; other threads may only read.
+One thread owns the bridge, see ``setpoint_thread``; other threads may only read it.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Bridge:
     :param forwarder: if given, its odometry is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
     :param require_failsafe: whether offboard requires the ``offboard_rules`` of the dialect.
-    :param recommendations: this, ``estimate_rate`` and ``origin`` are those of ``Housekeeping``.
+    :param recommendations: like ``estimate_rate`` and ``origin``, as in ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
     :param end: conditions under which the bridge itself ends a flight.
     :param report_to_gcs: whether the pilot's ground station receives reports.
@@ -160,8 +160,8 @@ class Bridge:
         """
         Take odometry stamped at a time, s, to forward it; return '' or why it is refused.
 
-        Its vertical velocity is corrected by the barometer: the autopilot's height follows it,
-        in the hold mode too.
+        The barometer corrects the vertical velocity of the odometry, because the autopilot's
+        height follows this velocity, also in the hold mode.
         """
         if self.forwarder is None:
             return ''
@@ -370,11 +370,12 @@ class Bridge:
         """
         Send the final messages.
 
-        A vehicle that still flies our setpoints receives again the command by which a pending
-        request ends the flight, such as a landing; else the pilot's mode after a stick was moved,
-        or hold; none while its mode is unknown. The last message is a level setpoint, because
-        autopilots obey it for up to seconds: after that time a braking one would make the vehicle
-        fly backwards.
+        A vehicle that still flies our setpoints receives a command. If a pending request ends the
+        flight (a landing, or the pilot's mode after a moved stick), its command is sent again;
+        else the command of the pilot's mode if a stick moved, or of the hold mode. While the mode
+        is unknown, no command is sent. The last message is a level setpoint, because autopilots
+        obey it for up to seconds: a braking setpoint would make the vehicle fly backwards after it
+        has stopped.
         """
         # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (

@@ -15,10 +15,10 @@
 """
 One request to the autopilot: a mode, arming, a take-off, a landing.
 
-An ACK is not enough: PX4 answers DO_SET_MODE with two ACKs, and the first is always ACCEPTED. A
-request succeeds when the vehicle shows the result (the mode in HEARTBEAT, the height after a
-take-off). If it does not, the result in the ACK and the autopilot's STATUSTEXT give the reason. A
-HEARTBEAT from before the command was sent does not count.
+An ACK does not prove success: PX4 answers DO_SET_MODE with two ACKs, and the first is always
+ACCEPTED. A request succeeds when telemetry shows the result (the mode in HEARTBEAT, the height
+after a take-off). If telemetry does not show the result, the ACK and the autopilot's STATUSTEXT
+give the reason. A HEARTBEAT from before the command does not count.
 
 ``Goal`` is the requested state, ``Request`` the state machine that pursues it.
 """
@@ -76,7 +76,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
-    """A request: its command, and how the vehicle shows that it is fulfilled."""
+    """The goal of a request: its command, and the telemetry that shows the result."""
 
     name: str
     command: int
@@ -115,7 +115,7 @@ def offboard(dialect: Dialect) -> Goal:
 
 
 def hold(dialect: Dialect) -> Goal:
-    """Return the goal of keeping the position; PX4 has no Hold without a global origin."""
+    """Return the goal of the hold mode; PX4 has no Hold without a global origin."""
     goal = enter(dialect, dialect.hold, *dialect.hold_instead, ends_flight=True)
     return replace(goal, name='hold', reached=lambda vehicle: not vehicle.status.offboard)
 
@@ -139,8 +139,9 @@ def arm(dialect: Dialect, value: bool, mode: str = '', streaming: bool = False) 
     Return the goal of arming or disarming; disarming in the air is refused by autopilots.
 
     After a landing ArduPilot stays in LAND, and PX4 returns to OFFBOARD or AUTO.TAKEOFF. ArduPilot
-    does not arm in LAND. PX4 arms in OFFBOARD only while ``streaming`` setpoints, and climbs at
-    once if armed in AUTO.TAKEOFF. So arming in such a ``mode`` requests another one first.
+    does not arm in LAND. PX4 arms in OFFBOARD only while setpoints are sent (``streaming``), and
+    climbs at once if armed in AUTO.TAKEOFF. So the goal of arming in such a ``mode`` begins with
+    another mode.
     """
     stuck = mode in dialect.unarmable_modes and not (streaming and mode == dialect.offboard)
     return Goal(name='arm' if value else 'disarm', command=_ARM, params=(float(value),),
@@ -155,7 +156,7 @@ def takeoff(dialect: Dialect, height: float, altitude: float, sea_level_altitude
     Return the goal of climbing by ``height``, m, from the present height.
 
     Autopilots end a take-off a little below that height. ArduPilot takes off in its offboard mode.
-    A climb that takes too long may go on: the vehicle lands.
+    If the climb takes too long, the vehicle lands, because it could continue to climb.
 
     :param altitude: present height above the local origin, m.
     :param sea_level_altitude: present height above sea level, m; None if unknown.
@@ -178,7 +179,7 @@ class Request:
 
     It takes every COMMAND_ACK; ``step``, called often, returns whether to send its command.
 
-    :param superseded: the goal of a pending request, which may still be reached.
+    :param superseded: the goal of the request that this one replaces; it may still be reached.
     :param own: whether the bridge, not a person, makes the request.
     """
 
@@ -216,9 +217,9 @@ class Request:
     def step(self, vehicle: Vehicle | None, *, streaming_for: float, texts: StatusTexts,
              now: float) -> int | None:
         """
-        Return the confirmation count with which to send the command of ``current`` now, or None.
+        Return the confirmation count if the command of ``current`` is to be sent now, else None.
 
-        :param vehicle: its state now, None if no HEARTBEAT is fresh.
+        :param vehicle: its present state, None if no HEARTBEAT is fresh.
         :param streaming_for: time for which setpoints have been sent without a gap, s.
         """
         if self.outcome is not None or (vehicle is not None and self._is_shown(vehicle, now)):

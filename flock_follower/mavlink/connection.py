@@ -13,12 +13,11 @@
 # limitations under the License.
 
 """
-Connection URLs, and the texts of errors of their devices, with remedies.
+Connection URLs, and the texts of device errors with remedies.
 
 ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
-``/dev/DEVICE[,BAUD]`` is a serial port. The forms of other programs for the same are taken:
-pymavlink's ``udp:`` (``udpin:``), ``udpin://HOST:PORT``, ``/dev/DEVICE:BAUD``,
-``serial:///dev/...``.
+``/dev/DEVICE[,BAUD]`` is a serial port. Other programs' forms are accepted, too: pymavlink's
+``udp:`` (``udpin:``), ``udpin://HOST:PORT``, ``/dev/DEVICE:BAUD``, ``serial:///dev/...``.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ def parse_connection(url: str) -> Connection:
     """
     Return the parts of a connection URL.
 
-    :raises ValueError: naming the URL and the valid forms, or the one that is meant.
+    :raises ValueError: naming the URL and the valid forms, or the most similar valid URL.
     """
     if network := _NETWORK.fullmatch(url):
         kind, port = 'udpin' if network[1] == 'udp' else network[1], int(network[3])
@@ -104,8 +103,8 @@ def explain_error(error: BaseException, device: str = '', sending: bool = False)
     """
     Return the text of an OSError or termios.error, with its name and the remedy.
 
-    :param device: the serial port that it is about, '' for a network.
-    :param sending: whether a datagram was sent, not an address taken.
+    :param device: the serial port of the error, '' for a network.
+    :param sending: whether a datagram was sent; else an address was opened.
     """
     number = getattr(error, 'errno', None) or error.args[0]
     text = str(getattr(error, 'strerror', None) or error.args[-1])

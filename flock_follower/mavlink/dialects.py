@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The supported autopilots as records of data: modes, take-off, frames, messages, rules."""
+"""The supported autopilots as records: modes, take-off, frames, messages, rules."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ class Version(NamedTuple):
 
 
 def firmware_version(message: Any) -> Version | None:
-    """Return the version in an AUTOPILOT_VERSION, None if it names none (0)."""
+    """Return the version in an AUTOPILOT_VERSION, None if the version is 0."""
     number = message.flight_sw_version
     version = Version(number >> 24 & 0xFF, number >> 16 & 0xFF, number >> 8 & 0xFF)
     return version if any(version) else None
 
 
 class Rule(NamedTuple):
-    """A parameter, and the values of it with which nothing may be flown by setpoints."""
+    """A parameter, and its values with which setpoints must not be flown."""
 
     name: str
     forbidden: Callable[[float], bool]
@@ -182,7 +182,7 @@ class Dialect:
                 or f'mode {main}.{sub}')
 
     def arming_mode(self, mode: str) -> str:
-        """Return the mode in which ``arm`` arms: another one if this one is unarmable."""
+        """Return the mode in which ``arm`` arms: this mode, or another if it cannot be armed."""
         return self.arming_modes[0] if mode in self.unarmable_modes else mode
 
     def set_mode_parameters(self, name: str) -> tuple[float, ...]:
@@ -300,8 +300,8 @@ def dialect_of(heartbeat: Any, autopilot: str = AUTO) -> Dialect | None:
     """
     Return the dialect of the sender of a HEARTBEAT, None if it is not supported.
 
-    :param autopilot: 'auto' follows the HEARTBEAT; a name requires this firmware, and accepts one
-        that HEARTBEAT does not name.
+    :param autopilot: 'auto' takes the firmware in the HEARTBEAT; a name requires this firmware,
+        and also accepts a HEARTBEAT that names no firmware.
     """
     sender = next((d for d in DIALECTS.values() if d.firmware == heartbeat.autopilot), None)
     if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_INVALID or (  # a gimbal, a ground station

@@ -15,9 +15,9 @@
 """
 Whether the autopilot's velocity may be used, and whether its messages arrive often enough.
 
-An estimator that has lost its last source integrates gyros and accelerometers, and reports a
-velocity for seconds: braking on it speeds the vehicle up. Measured on PX4 1.16 after the loss of
-vision: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
+An estimator that has lost its last source integrates gyros and accelerometers, and still reports a
+velocity for seconds. Braking with this wrong velocity accelerates the vehicle: on PX4 1.16 after
+the loss of vision to 5.6 m/s within 12 s, while LOCAL_POSITION_NED continued.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def velocity_fault(status: EstimatorStatus | None, gps: GpsFix | None, forwarded
     """
     Return why the autopilot's velocity is invalid at ``now``, s, or ''.
 
-    :param status: the newest, None if it sends none.
-    :param gps: the newest, None if it sends none.
+    :param status: the newest status, None if the autopilot sends none.
+    :param gps: the newest GPS fix, None if the autopilot sends none.
     :param forwarded: time since ODOMETRY was last sent, s; infinite if never.
     """
     return first_reason(
@@ -138,7 +138,7 @@ class Arrivals:
         self._times: defaultdict[int, deque[float]] = defaultdict(deque)
 
     def take(self, message_id: int, now: float) -> None:
-        """Take a message that came at ``now``."""
+        """Take a message that arrived at ``now``."""
         for times in (self._times[message_id], self._times[ALL_MESSAGES]):
             times.append(now)
             while now - times[0] > REPORT_WINDOW:
@@ -154,7 +154,7 @@ class Arrivals:
         return len(self.recent(message_id, now)) / REPORT_WINDOW
 
     def longest_pause(self, now: float) -> float:
-        """Return the longest pause in all messages within the last REPORT_WINDOW, s."""
+        """Return the longest time without any message within the last REPORT_WINDOW, s."""
         times = [*self.recent(ALL_MESSAGES, now), now]
         return max((later - time for time, later in pairwise(times)), default=0.0)
 

@@ -15,13 +15,13 @@
 """
 The global origin of an autopilot that flies without GPS, set before any odometry is sent.
 
-PX4 needs an origin for its Hold. Since its change 1cde309317 (1.18) an origin that arrives after
-vision moves the estimate by the distance to the origin before. So the origin comes first: the
+PX4 needs an origin for its Hold. Since commit 1cde309317 (PX4 1.18), an origin that arrives after
+vision moves the estimate by the distance from the previous origin. So the origin is set first: the
 bridge requests GPS_GLOBAL_ORIGIN, sends SET_GPS_GLOBAL_ORIGIN if none exists, and forwards
-odometry from the moment at which the autopilot returns the origin. An existing origin stays. In
-the air none is sent, and odometry never waits.
+odometry once the autopilot has returned the origin. An existing origin is kept. In the air the
+bridge sends no origin, and odometry does not wait.
 
-ArduPilot takes a configured origin once its estimate has a velocity.
+ArduPilot accepts an origin once its estimate has a velocity.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class GlobalOrigin:
         self.begin_again()
 
     def begin_again(self) -> None:
-        """Reset all, the origin too, after a reboot of the autopilot or with another autopilot."""
+        """Reset everything, also the origin, after a reboot or replacement of the autopilot."""
         self.obstacle, self.awaited = '', self._without_gps
         # Of the last message about it, and of the first step, s.
         self._time, self._began = -math.inf, math.inf

@@ -15,15 +15,15 @@
 """
 Requests beside the flight: telemetry rates, clock offset, version, parameters, reasons.
 
-Every request is repeated after a reboot of the autopilot and with another vehicle; when a lost
-link returns only the telemetry is requested again, the answers are kept.
+Every request is repeated after a reboot of the autopilot, and with another vehicle. When a lost
+link returns, only the telemetry is requested again; the answers are kept.
 
 ``TimeSync`` measures the offset between the autopilot's clock and ours by TIMESYNC, and answers
 the autopilot's own requests. A request has ``tc1 = 0`` and the sender's time in ``ts1``; the
 answer has the other clock's time in ``tc1`` and the same ``ts1``. PX4 learns our clock from our
-answers, and from then on expects ``time_usec`` of ODOMETRY in it. Both autopilots answer with the
-time since boot (PX4 ``hrt_absolute_time``, ArduPilot ``AP_HAL::micros64``): the clock of their
-``time_boot_ms``.
+answers; after that, ``time_usec`` of ODOMETRY must be on our clock. Both autopilots answer with
+the time since boot (PX4 ``hrt_absolute_time``, ArduPilot ``AP_HAL::micros64``), which is also the
+clock of ``time_boot_ms``.
 """
 
 from __future__ import annotations
@@ -95,11 +95,11 @@ class TimeSync:
         Return the largest possible age, s, of a message received now and stamped ``time_boot_ms``.
 
         An answer is written after its request, so the autopilot's clock is ahead of ours by at
-        most ``tc1 - ts1``. The age is therefore never too small: it includes the shortest delay
-        to the autopilot, as control loops through it do. The age is 0 if unknown: without a
-        stamp (0), before the second answer, if the autopilot's clock runs faster or slower than
-        ours, as in simulators, and if the stamp is ahead of the clock of its answers. A stamp
-        behind that clock is used, however old it is.
+        most ``tc1 - ts1``. Therefore the returned age is never too small: it includes the shortest
+        delay of the link to the autopilot. The age is 0 (unknown) if the stamp is 0, before the
+        second answer, if the autopilot's clock runs faster or slower than ours (simulators), and
+        if the stamp is ahead of the clock of the answers. A stamp behind this clock is used,
+        however old it is.
         """
         if not time_boot_ms:
             return 0.0
@@ -162,8 +162,8 @@ class Housekeeping:
     :param recommendations: the parameters to compare, by the name of the dialect.
     :param estimate_rate: requested rate of the autopilot's position and attitude, Hz.
     :param origin: latitude, longitude, deg, and height, m, sent to an estimator without an origin.
-    :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
-        receives ``global_origin.ANY_ORIGIN`` if ``origin`` is None.
+    :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold. If
+        ``origin`` is None, PX4 receives ``global_origin.ANY_ORIGIN``.
     """
 
     def __init__(self, link: Link, recommendations: Mapping[str, Sequence[Recommendation]] | None,
@@ -225,7 +225,7 @@ class Housekeeping:
         self._request_reasons_in_time(now)
 
     def changes(self) -> list[str]:
-        """Return changes in flight of parameters that a rule depends on."""
+        """Return the changes in flight of parameters on which a rule depends."""
         status = self._link.telemetry.status
         return self.watch.step(self.parameters.values, self.parameters.watched_names(),
                                status is not None and status.armed)
@@ -250,7 +250,7 @@ class Housekeeping:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
     def has_reasons(self, now: float) -> bool:
-        """Return whether the autopilot has answered which reasons prevent arming."""
+        """Return whether the autopilot has answered the request for its reasons."""
         return WHY_WAIT <= now - self._reasons_since < math.inf and (
             now - self._link.questions.answer_time(REASONS) <= 2.0 * WHY_PERIOD)
 

@@ -88,7 +88,7 @@ def device(message: Any) -> str:
 
 def not_hovering(vehicle_type: int | None, vtol_state: int | None) -> str:
     """
-    Return why a vehicle does not fly as a multicopter, or ''.
+    Return why a vehicle is not a hovering multicopter or VTOL, or ''.
 
     :param vehicle_type: MAV_TYPE. :param vtol_state: MAV_VTOL_STATE; None: not reported.
     """
@@ -110,8 +110,8 @@ class TwoSources(Generic[T]):
     """
     Detects values that come alternately from two sources.
 
-    :param distance: between two values. :param most: the largest distance of two values of one
-        source that are so many s apart.
+    :param distance: returns the distance between two values. :param most: returns the largest
+        distance between two values of one source, from the time between them, s.
     """
 
     def __init__(self, distance: Callable[[T, T], float],
@@ -172,7 +172,7 @@ class Identity:
         self._rivals: deque[float] = deque(maxlen=_RIVAL_BEATS)  # when another's arrived, s
 
     def sent_heartbeat(self, number: int) -> None:
-        """Take the sequence number of a HEARTBEAT of ours, which a line may echo."""
+        """Take the sequence number of our own HEARTBEAT, which a line may echo."""
         self._beats.append(number)
 
     def take_own(self, message: Any, now: float) -> None:
@@ -181,7 +181,7 @@ class Identity:
             self._rivals.append(now)
 
     def take(self, message: Any, peer: Any, answered: bool, now: float) -> None:
-        """Take a message of the autopilot; ``answered``: whether ours are sent to its sender."""
+        """Take a message of the autopilot; ``answered``: whether our messages go to its sender."""
         kind = message.get_type()
         if peer not in self._peers:
             if len(self._peers) >= _MOST_PEERS:
@@ -216,7 +216,7 @@ class Identity:
         return f'{TWO_VEHICLES}, by their {" and ".join(evidence)}: {_REMEDY}' if evidence else ''
 
     def is_same(self, before: Any, peer: Any) -> bool:
-        """Return whether a vehicle is known to have changed only its address, as by a router."""
+        """Return whether a sender is the known vehicle at another address (a restarted router)."""
         old, new = self._peers.get(before), self._peers.get(peer)
         if old is None or new is None or not old.boots or not new.boots:
             return False

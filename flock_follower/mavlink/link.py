@@ -15,12 +15,12 @@
 """
 One MAVLink 2 link to one autopilot: framing, signing, addresses, message rates.
 
-Only messages of the configured system id are used. Others are counted, so that the bridge can
-explain a silence. The caller passes the time and calls from one thread.
+Only messages of the configured system id are used. Other messages are counted, so that the bridge
+can explain why it receives no autopilot. The caller passes the time and calls from one thread.
 
-``Framer`` finds messages in bytes that may contain garbage. pymavlink's own parser trusts a byte
-that looks like the start of a message, and discards up to 280 bytes of good messages if it was
-none. ``Framer`` consumes only messages whose checksum is right.
+``Framer`` finds messages in bytes that may contain garbage. pymavlink's parser accepts each start
+byte, and discards up to 280 bytes of good messages if the byte does not begin a message.
+``Framer`` consumes only messages whose checksum is right.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ BAD_SIGNATURE: Final[str] = (
 
 
 class Codec(mavlink.MAVLink):  # type: ignore[misc]
-    """Decodes the messages of one sender, and refuses forged ones and those from the future."""
+    """Decodes the messages of one sender; refuses messages that are forged or from the future."""
 
     latest = 0
     """The latest timestamp to accept."""
@@ -87,9 +87,9 @@ class Framer:
 
     def feed(self, data: bytes, most: int = 10_000) -> tuple[list[Any], Counter[str]]:
         """
-        Return the messages that are whole now, and how many pieces were not used and why.
+        Return the complete messages, and the numbers of unused pieces by reason.
 
-        After ``most`` starts of messages, true and false, the rest is dropped.
+        After ``most`` start bytes, true or false, the remaining bytes are dropped.
         """
         buffer = self._waiting + data
         messages: list[Any] = []
@@ -131,7 +131,7 @@ class Framer:
 
 
 def frame_length(buffer: bytearray, start: int) -> int:
-    """Return the length of the message that starts there; 3, the length needed, if unknown."""
+    """Return the length of the message that begins here; 3 if fewer than 3 bytes are known."""
     if len(buffer) < start + 3:
         return 3
     marker, payload, flags = buffer[start:start + 3]
@@ -173,7 +173,7 @@ class Signing:
         self._reference = self.state.timestamp, math.nan  # a timestamp, and its time, s
 
     def latest(self, now: float) -> int:
-        """Return the latest timestamp to accept; the first ``now``, s, is that of the start."""
+        """Return the latest timestamp to accept; the first ``now``, s, is the start's."""
         timestamp, since = self._reference
         if math.isnan(since):
             self._reference = timestamp, now
@@ -182,9 +182,9 @@ class Signing:
 
     def set_clock(self, unix_time: float, now: float) -> None:
         """
-        Follow the system clock, which may be set after the start, but never back.
+        Follow the system clock forward if it is set after the start; never back.
 
-        A timestamp must not decrease, and the autopilot's has followed ours.
+        A timestamp must not decrease, and the autopilot has adopted our last timestamp.
         """
         timestamp = _timestamp(unix_time)
         if timestamp > self.latest(now) - int(MOST_AHEAD * _SIGNING_TICKS):
@@ -221,11 +221,11 @@ class Link:
     """
     A link over a transport to the autopilot of ``target_system``.
 
-    :param source_system: our own system id; 0: that of the vehicle, as MAVLink wants it of its
+    :param source_system: our own system id; 0: the vehicle's id, as MAVLink requires of a
         companion.
     :param autopilot: firmware of the autopilot, see ``dialects.dialect_of``.
     :param signing: if given, every message is signed and unsigned ones are dropped.
-    :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
+    :param announce_as_gcs: whether our HEARTBEAT is that of a ground station.
     """
 
     def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 0,
@@ -261,7 +261,7 @@ class Link:
         return codec
 
     def receive(self, now: float) -> list[Any]:
-        """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
+        """Return the autopilot's messages that have arrived, and update the telemetry."""
         messages = []
         self._now = now
         self.transport.reopen(now)
@@ -363,7 +363,7 @@ class Link:
             self.target_system, AUTOPILOT_COMPONENT, name.encode('ascii'), -1))
 
     def silence(self) -> str:
-        """Return a text that names the messages received instead of the autopilot's."""
+        """Return a text about the messages that arrive instead of the autopilot's messages."""
         # A copy: the setpoint thread adds to it.
         why = ', '.join(f'{count} {reason}' for reason, count in self.ignored.copy().items())
         return f'received, but not used: {why}' if why else 'nothing arrives'

@@ -15,9 +15,9 @@
 """
 The questions to the autopilot, and its answers: without an answer the value is unknown.
 
-``sent`` and ``take`` recognize questions and answers in the messages themselves, so that no
-question can be asked without being counted. Only a message that exists because of ours is an
-answer: telemetry arrives on a line whose other direction is cut, too. Times are s.
+``sent`` and ``take`` recognize questions and answers in the messages themselves, so every question
+is counted. Only a message that the autopilot sends because of our message is an answer: telemetry
+also arrives if our transmit wire is cut. Times are s.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _REQUESTS: Final = (mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAV_CMD_SET_MESSAGE
 
 @dataclass
 class Question:
-    """One question; ``tries`` and ``since``, s, count from the first one after an answer."""
+    """One question; ``tries`` and ``since``, s, count from the first try after an answer."""
 
     tries: int = 0
     since: float = math.inf
@@ -58,7 +58,7 @@ class Question:
     """Time of the newest answer, s."""
 
     def ask(self, now: float) -> None:
-        """Count a question at ``now``."""
+        """Count a try at ``now``."""
         self.tries += 1
         self.since = min(self.since, now)
 
@@ -67,7 +67,7 @@ class Question:
         self.tries, self.since, self.answered = 0, math.inf, now
 
     def is_ignored(self, now: float) -> bool:
-        """Return whether the question has had no answer for enough tries and time."""
+        """Return whether the question got no answer after enough tries and time."""
         return self.tries >= TRIES and now - self.since >= PATIENCE
 
 
@@ -85,7 +85,7 @@ class LinkQuestions:
         self._any = Question()
 
     def begin_again(self) -> None:
-        """Forget all answers: the autopilot has rebooted, or is another one."""
+        """Forget all answers: the autopilot has rebooted, or was replaced."""
         self._questions, self._any = {}, Question()
 
     def pause(self) -> None:
@@ -153,7 +153,7 @@ class LinkQuestions:
         return [*filter(None, (name if name == RATES else '', requested))] or [name]
 
     def is_addressed(self, ack: Any) -> bool:
-        """Return whether a COMMAND_ACK is to us; MAVLink 1 has no target (0)."""
+        """Return whether a COMMAND_ACK is for us; in MAVLink 1 its target is 0."""
         return all(target in (0, own) for target, own in zip(
             (ack.target_system, ack.target_component), self._source))
 

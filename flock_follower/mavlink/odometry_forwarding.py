@@ -15,9 +15,9 @@
 """
 Forwards odometry to the autopilot as ODOMETRY, for flight without GPS.
 
-Each autopilot takes it in one pair of frames only: PX4 LOCAL_NED and BODY_FRD, ArduPilot LOCAL_FRD
-and BODY_FRD, both with the same numbers (ENU turned into NED). The velocity is that of the body,
-``time_usec`` our own monotonic clock, which the autopilot learns by TIMESYNC.
+Each autopilot accepts one pair of frames: PX4 LOCAL_NED and BODY_FRD, ArduPilot LOCAL_FRD and
+BODY_FRD, with the same numbers (ENU converted to NED). The velocity is in the body frame.
+``time_usec`` is our monotonic clock, which the autopilot learns by TIMESYNC.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _UPPER = np.triu_indices(6)
 
 class OdometryForwarder:
     """
-    Takes odometry, and returns messages at no more than the rate that the line can carry.
+    Takes odometry, and returns messages at no more than a rate, Hz.
 
     :param rate: largest rate of the messages, Hz; a link of 57,600 baud carries 10 of 245 bytes.
     """
@@ -147,11 +147,11 @@ def has_jumped(before: OdometryState, then: float, after: OdometryState, now: fl
 
 def quality(state: OdometryState, age: float) -> int:
     """
-    Return the quality of a state of an age, s, %, which autopilots compare with a parameter.
+    Return the quality, %, of a state of an age, s; autopilots compare it with a parameter.
 
     PX4 refuses ODOMETRY below EKF2_EV_QMIN, ArduPilot below VISO_QUAL_MIN; 0 means unknown. The
-    quality falls in proportion to the deviation of the velocity beyond that of ODOMETRY_STD, and
-    with the age. An unknown covariance counts half.
+    quality decreases with the age, and if the standard deviation of the velocity exceeds that in
+    ODOMETRY_STD. An unknown covariance halves the quality.
     """
     expected = ODOMETRY_STD[2]
     if _is_known(state.velocity_covariance):
@@ -167,9 +167,9 @@ def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_c
     """
     Return the ODOMETRY message of a state, at a time, s, in the frames of the autopilot.
 
-    Covariances are the row-major upper triangles of (6, 6). One that is missing (zeros), not
-    finite, above ``SANE`` or without positive variances is replaced by a diagonal of the
-    deviations ``ODOMETRY_STD``.
+    Covariances are the row-major upper triangles of (6, 6). A covariance that is missing (zeros),
+    not finite, above ``SANE`` or without positive variances is replaced by a diagonal matrix from
+    the standard deviations ``ODOMETRY_STD``.
     """
     R_enu_flu = quaternion_to_matrix(state.quaternion)
     position_std, attitude_std, velocity_std, rate_std = ODOMETRY_STD

@@ -17,9 +17,9 @@ Reads the autopilot's parameters that the bridge depends on, and reports differe
 
 The bridge writes no parameter. The recommendations are the files in ``config/`` that
 QGroundControl (``.params``) and MAVProxy (``.parm``) load; the comment before an entry gives its
-reason. Two lines of that comment have a fixed form: ``Good: 1, 3 to 5`` lists the values that are
-as good as the recommended one, without it no other is; ``Versions: 1.18 and later``, ``Versions:
-up to 1.17`` or ``Versions: 1.15 to 1.17`` names the firmware that has the parameter.
+reason. Two lines of this comment have a fixed form. ``Good: 1, 3 to 5`` lists other accepted
+values; without this line only the recommended value is accepted. ``Versions: 1.18 and later``,
+``Versions: up to 1.17`` or ``Versions: 1.15 to 1.17`` names the firmware that has the parameter.
 
 ``obstacle`` returns the parameter that forbids ``offboard``, and the reason.
 """
@@ -75,12 +75,12 @@ class Recommendation(NamedTuple):
     """The first and last firmware that has it, major and minor."""
 
     def differs(self, value: float) -> bool:
-        """Return whether a value is neither the recommended one nor known to be as good."""
+        """Return whether a value is neither recommended nor accepted."""
         return not (any(low <= value <= high for low, high in self.good)
                     or math.isclose(value, self.value, rel_tol=1e-5, abs_tol=1e-9))
 
     def applies(self, version: Version | None) -> bool:
-        """Return whether a firmware has the parameter; None: whether all known versions do."""
+        """Return whether a firmware has the parameter; for None: whether all versions have it."""
         if version is None:
             return (self.since, self.until) == (_FIRST_VERSION, _LAST_VERSION)
         return self.since <= version[:2] <= self.until
@@ -90,7 +90,7 @@ def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]
     """
     Return the entries of a ``.params`` or ``.parm`` file.
 
-    :param forwarding: whether to return those that matter only with forwarded odometry, too.
+    :param forwarding: whether to include the entries that matter only with forwarded odometry.
     :raises ValueError: naming the first line that is malformed.
     """
     found: list[Recommendation] = []
@@ -174,9 +174,9 @@ class ParameterCheck:
     ``values`` holds the autopilot's answers, ``missing`` the parameters that do not exist.
     ``result`` may be called from any thread, everything else from one.
 
-    :param recommended: those that ``version`` does not have are not requested.
-    :param dialect: of the autopilot; None: it is not known yet, and nothing is requested.
-    :param needed: names to read, and not to compare.
+    :param recommended: entries that ``version`` does not have are not requested.
+    :param dialect: of the autopilot; None while it is unknown: nothing is requested.
+    :param needed: names to read without a comparison.
     """
 
     def __init__(self, recommended: Sequence[Recommendation] = (), dialect: Dialect | None = None,
@@ -222,7 +222,7 @@ class ParameterCheck:
         return ''.join(due[:1])
 
     def watched_names(self) -> list[str]:
-        """Return the names to read repeatedly: answered before, and part of a rule."""
+        """Return the names to read repeatedly: parameters of a rule that were answered before."""
         if self._dialect is None:
             return []
         kept = {*self._dialect.watched, *(rule.name for rule in self._dialect.offboard_rules)}
@@ -256,7 +256,7 @@ class ParameterCheck:
             self.missing.add(name)
 
     def take_version(self, message: Any) -> None:
-        """Take an AUTOPILOT_VERSION; more parameters may have to be read then."""
+        """Take an AUTOPILOT_VERSION, which can add parameters to read."""
         version = firmware_version(message)
         if version is not None and version != self.version:
             self.version = version
@@ -304,7 +304,7 @@ def applicable_rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
 
 
 def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
-    """Return the reason in the autopilot's parameters against flying by setpoints, or ''."""
+    """Return the parameter of the autopilot that forbids ``offboard``, and why, or ''."""
     values, applicable = parameters.values, applicable_rules(dialect, forwarding)
     for rule in applicable:
         if rule.name in values and rule.forbidden(values[rule.name]):

@@ -96,7 +96,7 @@ def gate_limits(values: Mapping[str, Any]) -> GateLimits:
     """
     Return the limits of the gate in the values of mavlink_bridge.
 
-    :raises ValueError: if they do not fit together, or cannot fly.
+    :raises ValueError: if the values contradict each other, or cannot fly.
     """
     limits = filled(GateLimits(), values)
     refuse(values)
@@ -107,7 +107,7 @@ def origin(values: list[float]) -> tuple[float, float, float] | None:
     """
     Return latitude and longitude, deg, and height, m, or None for zeros.
 
-    :raises ValueError: if they are no place on Earth.
+    :raises ValueError: if the values are no place on Earth.
     """
     if not any(values):
         return None
@@ -121,8 +121,8 @@ def recommendations(forwarding: bool, takeoff_height: float) -> dict[str, list[R
     """
     Return the recommended parameters of each autopilot by the name of its dialect.
 
-    :param forwarding: whether odometry is forwarded, which takes more of them.
-    :param takeoff_height: m; an autopilot that would climb higher by itself is to climb no higher.
+    :param forwarding: whether odometry is forwarded, which needs more parameters.
+    :param takeoff_height: m; the autopilot's own take-off height must not exceed it.
     """
     found = {}
     for dialect in DIALECTS.values():

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Parameters of the autopilot that change in flight although a rule depends on them.
+Detects that a parameter of the autopilot changes in flight, although a rule depends on it.
 
 ``offboard`` was permitted with the values at take-off: failsafe, frame, source of the height. A
-change is reported, stops no flight, and refuses the next ``offboard`` until the value is set back
-or the vehicle is disarmed. Times are s.
+change is reported, and the flight continues. The next ``offboard`` is refused until the value is
+restored or the vehicle is disarmed. Times are s.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _REMEDY: Final[str] = 'set it back, or land and disarm'
 
 
 class ParameterWatch:
-    """The values of a flight: those at the time of arming, or the first that were read later."""
+    """The values of a flight: the values at arming, or the first values that were read later."""
 
     def __init__(self) -> None:
         self._flown: dict[str, float] = {}
@@ -45,7 +45,7 @@ class ParameterWatch:
         """
         Take the newest values; return each new change as text.
 
-        :param names: those that a rule depends on.
+        :param names: of the parameters on which a rule depends.
         """
         if not armed:
             self._flown, self._changes = {}, {}

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Requests by people and by the bridge itself: arm, offboard, take off, land; one at a time.
+Requests by people and by the bridge: arm, offboard, take off, land; one at a time.
 
-A request that cannot succeed, or is dangerous, is refused here. Otherwise it is sent to the
-autopilot, and the permission to send setpoints follows the request and its outcome.
+A request that cannot succeed, or is dangerous, is refused here. Other requests are sent to the
+autopilot. The permission to send setpoints changes with the request, and with its outcome.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ TOLERANCE: Final[float] = 0.1
 
 class Requests:
     """
-    Begins requests and steps the one whose outcome is open.
+    Begins requests, and continues the pending request.
 
     :param end: end of the flight; reset by a request of an operator.
     :param require_failsafe: whether offboard requires the ``offboard_rules`` of the dialect.
@@ -109,7 +109,7 @@ class Requests:
 
     @property
     def pending(self) -> Request | None:
-        """Return the request whose outcome is open, if there is one."""
+        """Return the pending request, if there is one."""
         request = self.newest
         return request if request is not None and request.outcome is None else None
 
@@ -131,8 +131,8 @@ class Requests:
         Begin a request.
 
         :param make: returns the goal for an autopilot.
-        :param obstacle: why it is refused at once, or ''.
-        :param end: why the bridge itself requests it; for a request by a person empty.
+        :param obstacle: why the request is refused at once, or ''.
+        :param end: why the bridge makes the request; '' for a request by a person.
         """
         gate, pending, superseded = self._gate, self.pending, None
         dialect = self._link.telemetry.dialect
@@ -201,7 +201,7 @@ class Requests:
         """
         Return why the vehicle may not fly our setpoints now, by the received messages, or ''.
 
-        :param in_air: whether it must be in the air, and in the envelope, now.
+        :param in_air: whether the vehicle must be in the air, and inside the envelope.
         """
         telemetry, gate = self._link.telemetry, self._gate
         dialect = telemetry.dialect

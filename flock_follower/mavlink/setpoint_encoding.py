@@ -15,7 +15,7 @@
 """
 ``encode_setpoint`` makes SET_POSITION_TARGET_LOCAL_NED of a setpoint.
 
-It holds acceleration and yaw in MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter both obey.
+The message has acceleration and yaw in MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter obey.
 """
 
 from __future__ import annotations

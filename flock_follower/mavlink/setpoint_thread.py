@@ -15,8 +15,8 @@
 """
 The setpoint thread: receives the autopilot's messages, and runs the cycles of the bridge.
 
-The thread uses the monotonic clock and waits for neither a ROS executor nor ``/clock``. If the
-thread blocks, its HEARTBEATs stop, too, so that the autopilot detects it.
+The thread uses the monotonic clock, and waits for neither a ROS executor nor ``/clock``. If the
+thread blocks, its HEARTBEATs also stop, so the autopilot detects the fault.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class SetpointThread:
 
     The thread owns the bridge; other threads ``submit`` actions on it. The thread calls
     ``on_messages(messages, now)`` with messages of the autopilot, ``on_cycle(cycle, now)`` after
-    each cycle and ``on_error(error)`` for an exception. If listening fails the cycle still runs,
-    and the other way round.
+    each cycle and ``on_error(error)`` for an exception. If receiving fails, the cycle still runs,
+    and vice versa.
     """
 
     def __init__(self, bridge: Bridge, period: float,
@@ -86,8 +86,8 @@ class SetpointThread:
         Callable from any thread; it never waits. An exception of the action is passed to
         ``on_error``.
 
-        :param refuse: called instead of the action if the thread ends before its turn.
-        :return: False if it is not run: too many wait, or the thread has ended.
+        :param refuse: called instead of the action if the thread ends before the action runs.
+        :return: False if the action is dropped: too many wait, or the thread has ended.
         """
         if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
             return False

@@ -17,15 +17,15 @@ Texts of the autopilot, and reports to the pilot's ground station.
 
 ``StatusTexts`` joins STATUSTEXT messages from their chunks, and reads the EVENTs of PX4.
 
-PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
-refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
-with the modes concerned, between two summaries. PX4 sends them after a change, and after
-MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``px4_events.txt`` has
-the names and texts of several versions. An event without a name there is reported by its number.
+PX4 sends STATUSTEXT only to links on which it receives a ground station, and sends no text if it
+refuses a mode. PX4 reports its arming checks by EVENTs on every link, after a change and after
+MAV_CMD_RUN_PREARM_CHECKS: between two summaries, one EVENT for each failed check, with the
+affected modes. An EVENT is a number, the hash of a name; ``px4_events.txt`` has the names and
+texts of several versions. An event that is missing there is reported by its number.
 
-``GroundStationReport`` reports the planner's state as STATUSTEXT and the distance as a number.
-They are broadcast on the autopilot's link. ArduPilot forwards them to the ground station; PX4 does
-so if the port of the companion has MAV_n_FORWARD 1. Times are s on a monotonic clock.
+``GroundStationReport`` sends the planner's state as STATUSTEXT and the distance as a number, both
+as broadcasts on the autopilot's link. ArduPilot forwards these messages to the ground station; PX4
+forwards them if the port of the companion has MAV_n_FORWARD 1. Times are s on a monotonic clock.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ CHUNK_TIMEOUT: Final[float] = 0.4
 
 
 class AutopilotText(NamedTuple):
-    """One whole text."""
+    """One complete text."""
 
     time: float
     """Time of reception of its end, s."""
@@ -221,7 +221,7 @@ class StatusTexts:
         self._begun = None
 
     def against(self, mode: str) -> list[str]:
-        """Return the failed checks for a mode (a name of ``dialects.PX4``) or for arming in it."""
+        """Return the failed checks for a mode (a name of ``dialects.PX4``), or for its arming."""
         return [failure.text for failure in self._failures
                 if mode in _MODES and failure.modes >> _MODES[mode] & 1
                 # Reports for every mode include warnings, which prevent none,
@@ -246,7 +246,7 @@ class StatusTexts:
             if t >= time and severity < mavlink.MAV_SEVERITY_INFO))
 
     def new(self, now: float) -> list[AutopilotText]:
-        """Return the texts since the last call; one without its end after CHUNK_TIMEOUT."""
+        """Return the texts since the last call; incomplete texts after CHUNK_TIMEOUT."""
         if self._begun is not None and now - self._begun.time > CHUNK_TIMEOUT:
             self._end()
         texts = list(self._new)
@@ -284,15 +284,15 @@ class GroundStationReport:
             self._state, self._state_time = state, now
 
     def take_distance(self, neighbor: str, distance: float, now: float) -> None:
-        """Take the distance, m, to the neighbor that the planner faces."""
+        """Take the distance, m, to the neighbor to which the follower turns."""
         self._neighbor, self._distance, self._distance_time = neighbor, distance, now
 
     def take_handover(self, reason: str) -> None:
-        """Take the reason for which the bridge ends the flight; it is the next text."""
+        """Take the reason why the bridge ends the flight; it becomes the next text."""
         self._handed_over = reason
 
     def take_warning(self, text: str) -> None:
-        """Take a warning, such as a parameter that has changed; it is one of the next texts."""
+        """Take a warning, such as a changed parameter; it becomes one of the next texts."""
         self._warnings.append(text)
 
     def due(self, time_boot_ms: int, now: float) -> list[Any]:

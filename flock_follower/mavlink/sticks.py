@@ -15,10 +15,11 @@
 """
 The pilot's sticks: whether the pilot has moved one since ``offboard`` was granted.
 
-From PX4 1.18 on MAN_OVERRIDE_SPD replaces COM_RC_OVERRIDE: PX4 itself takes over only if a stick
-moves fast. There the bridge hands over for a stick that has moved far, however slowly. The
-throttle may rest anywhere: it counts only if it has moved away and comes to its center, where
-Position mode keeps the height. Time is an argument; no clock is read.
+From PX4 1.18 on MAN_OVERRIDE_SPD replaces COM_RC_OVERRIDE: PX4 ends offboard only if a stick moves
+fast. With these versions the bridge hands over if a stick has moved far, however slowly. The
+throttle has no fixed rest position: it counts only if it has moved away from its position at
+``offboard`` and then comes to its center, where Position mode keeps the height. Time is an
+argument; no clock is read.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def needs_stick_handover(dialect: Dialect | None, parameters: ParameterCheck) ->
 
 
 def read_sticks(message: Any) -> Sticks | None:
-    """Return the sticks in a MANUAL_CONTROL or RC_CHANNELS; None if it has none that are valid."""
+    """Return the sticks in a MANUAL_CONTROL or RC_CHANNELS; None if its values are not valid."""
     if message.get_type() == 'MANUAL_CONTROL':
         # PX4 sends the throttle in [0, 1000].
         values = (message.y, message.x, message.r, 2 * message.z - _FULL)
@@ -103,7 +104,7 @@ class StickWatch:
         self._counts = {'stick': 0, 'throttle away': 0, 'throttle back': 0}
 
     def begin(self, now: float) -> None:
-        """Take the positions at ``now``, or those received next, as the rest positions."""
+        """Take the positions at ``now``, or the next positions received, as the rest positions."""
         self.has_moved = False
         self._rest = self._newest if now - self._time <= STICK_GAP else None
         self._counts = dict.fromkeys(self._counts, 0)

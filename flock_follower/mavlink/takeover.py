@@ -15,10 +15,10 @@
 """
 Determines who has taken over the vehicle: a pilot, or which failsafe of the autopilot.
 
-PX4 reports by CURRENT_MODE the mode that it flies and the mode that was chosen: a failsafe flies
-another mode than the chosen one, a pilot chooses one. PX4 names the cause in EVENTs. ArduPilot
-reports no chosen mode: it announces a failsafe by STATUSTEXT, and some modes are entered by no
-failsafe. What none of these shows is unknown, and counts as a pilot. Times are s.
+PX4 reports in CURRENT_MODE the flown mode and the chosen mode: a failsafe changes only the flown
+mode, a pilot changes the chosen mode. PX4 names the cause in EVENTs. ArduPilot reports no chosen
+mode, but announces a failsafe by STATUSTEXT; some modes are never entered by a failsafe. An
+unknown cause counts as a pilot. Times are s.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class TakeoverWatch:
             self._checks[_CHECKS[number]] = now
 
     def taker(self, dialect: Dialect, left: float) -> Taker:
-        """Return who left the mode of setpoints at a time, s, by the evidence until now."""
+        """Return who left the offboard mode at a time, s, by the evidence so far."""
         (mode, mode_time), (chosen, chosen_time) = self._mode, self._chosen
         if chosen_time >= left:
             return PILOT if chosen != dialect.offboard else failsafe(self._name(left) or UNNAMED)

@@ -15,7 +15,7 @@
 """
 The newest messages of the autopilot, in ENU and FLU, with their times of arrival.
 
-``estimate`` combines its position and attitude into one odometry, at the time it was valid.
+``estimate`` combines position and attitude to one odometry of the time at which both were valid.
 """
 
 from __future__ import annotations
@@ -173,9 +173,9 @@ class Telemetry:
 
     def shown(self, message: Any) -> VehicleStatus | None:
         """
-        Return the vehicle's status from a message, None if the message has none.
+        Return the vehicle's status from a message, None if the message has no status.
 
-        CURRENT_MODE has only the mode; the rest comes from the newest HEARTBEAT.
+        CURRENT_MODE has only the mode; the other values come from the newest HEARTBEAT.
         """
         kind = message.get_type()
         if self.dialect is None:
@@ -194,10 +194,10 @@ class Telemetry:
 
     def silence(self, now: float) -> float:
         """
-        Return how long messages of the autopilot have been overdue, s; 0 if none is.
+        Return for how long messages of the autopilot have been overdue, s; 0 if they are not.
 
-        Any message shows that the link is alive; the mode has its own clock, ``mode_age``. Before
-        telemetry streams only HEARTBEAT may come, at 1 Hz, and single ones may be lost.
+        Any message shows that the link is alive; ``mode_age`` measures the age of the mode. Before
+        telemetry is sent, only HEARTBEATs may arrive, at 1 Hz, and one of them may be lost.
         """
         if self.dialect is None:
             return math.inf
@@ -350,12 +350,12 @@ def estimate(position: LocalPosition, attitude: Attitude, age: float
     """
     Return the odometry, and the time of a position, s, at which it was valid.
 
-    None if the attitude does not belong to the position. The stamp of the odometry is 0.
+    None if the times of attitude and position differ too much. The stamp of the odometry is 0.
 
-    The two are measured at different times (20 ms at 1 rad/s are 5 cm at 2.5 m): the attitude is
-    extrapolated by its rates to the time of the position if the autopilot has stamped both.
+    If the autopilot has stamped both, the attitude is extrapolated by its rates to the time of the
+    position: without this, 20 ms at 1 rad/s would displace a neighbor at 2.5 m by 5 cm.
 
-    :param age: of the position at its arrival, s; 0 if it is unknown.
+    :param age: of the position at its arrival, s; 0 if unknown.
     """
     if abs(position.time - attitude.time) > ATTITUDE_TIMEOUT:
         return None

@@ -15,8 +15,8 @@
 """
 Bytes to and from an autopilot: UDP, TCP and serial, opened from a URL (see ``connection``).
 
-All calls are non-blocking, and none reads a clock. ``reopen`` opens a device that was unplugged, a
-connection that was closed, or one that is not there yet.
+No call blocks or reads a clock. ``reopen`` opens a device or a connection that was lost, or that
+did not exist yet.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class SerialTransport(_Line):
     """
     A serial port in raw mode, opened whenever the device is there and no other process has it.
 
-    A second process would receive a part of our bytes, and send its bytes between ours.
+    A second process would receive a part of the autopilot's bytes, and mix its bytes with ours.
     """
 
     def __init__(self, url: str, device: str, baud: int) -> None:
@@ -204,9 +204,9 @@ class SerialTransport(_Line):
 
 class TcpTransport(_Line):
     """
-    A TCP connection to a listening autopilot or simulator, made again when it is closed.
+    A TCP connection to a listening autopilot or simulator; a closed connection is opened again.
 
-    ``reopen`` waits for at most CONNECT_TIMEOUT: without a connection there is nothing to send.
+    ``reopen`` waits for at most CONNECT_TIMEOUT; meanwhile nothing can be sent anyway.
     """
 
     delivers_late = True
@@ -232,8 +232,8 @@ class UdpTransport(_Line):
     """
     A UDP socket, which is never lost once it is open.
 
-    A listening one sends only to the ``peer`` that its owner sets, not to each sender: a setpoint
-    must not reach a second vehicle by accident.
+    A listening socket sends only to the ``peer`` that its owner sets, not to every sender, so that
+    no setpoint reaches a second vehicle by accident.
     """
 
     _backlog = math.inf  # datagrams do not wait for each other here
@@ -278,7 +278,7 @@ class UdpTransport(_Line):
                 return
 
     def write(self, data: bytes) -> bool:
-        """Send one datagram to the peer; return whether it went out."""
+        """Send one datagram to the peer; return whether it was sent."""
         if self.peer is None or self._fd < 0:
             return False
         try:

@@ -30,7 +30,7 @@ _no_exit_deadline = False
 
 
 def on_signal(shut_down: Callable[[], object]) -> None:
-    """Set the function that a signal calls; before, a signal ends the process at once."""
+    """Set the function that a signal calls; without one a signal ends the process at once."""
     global _shut_down
     _shut_down = shut_down
 
@@ -39,8 +39,8 @@ def set_deadline() -> None:
     """
     End the process by SIGALRM if it still runs after SHUTDOWN_TIMEOUT.
 
-    Once in some thousand times Fast DDS spins for ever while it destroys a node, and holds the
-    GIL: no thread and no handler of Python can end that.
+    About once in some thousand shutdowns Fast DDS loops for ever while it destroys a node, and
+    holds the GIL: neither a thread nor a Python handler can end the process then.
     """
     if AS_A_PROGRAM and not _no_exit_deadline and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
@@ -48,7 +48,7 @@ def set_deadline() -> None:
 
 @contextlib.contextmanager
 def no_exit_deadline() -> Iterator[None]:
-    """Set no deadline inside the block, which may take long to finish its files."""
+    """Set no deadline inside the block: it may need a long time to finish its files."""
     global _no_exit_deadline
     _no_exit_deadline = True
     try:
@@ -58,7 +58,7 @@ def no_exit_deadline() -> Iterator[None]:
 
 
 def ignore_signals() -> None:
-    """Ignore further signals: one during the interpreter's exit must not change the exit code."""
+    """Ignore further signals, so that a signal during the exit does not change the exit code."""
     if AS_A_PROGRAM:
         for number in ending():
             signal.signal(number, signal.SIG_IGN)

@@ -15,11 +15,11 @@
 """
 The black box: records the topics that ``evaluate`` needs, within a limit of disk space.
 
-The node publishes only its diagnostics, and no node waits for it. It receives best effort (latched
-topics reliably), twenty times per second, decodes only the images that it compresses, and runs at
-low priority. A thread of its own writes to the disk within a second, see
-``bags.recording``. Topics are recorded by our names, without namespace and remaps, so that
-``evaluate``, ``check`` and ``replay`` take a recording as it is.
+The node publishes only its diagnostics, and no node waits for it. The node takes messages twenty
+times per second, with best effort (latched topics reliably), decodes only the images that it
+compresses, and runs at low priority. A separate thread writes the messages to the disk within a
+second, see ``bags.recording``. Topics are recorded under our names, without namespace and remaps,
+so ``evaluate``, ``check`` and ``replay`` need no options for a recording.
 """
 
 from __future__ import annotations

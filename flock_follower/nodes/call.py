@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Call a service for machines without the ``ros2`` command.
+Call a service on a machine without the ``ros2`` command.
 
 ``call planner/engage true`` calls a SetBool, ``call mavlink_bridge/takeoff`` a Trigger.
 
-Waits for the service to exist, at most ``--timeout``, calls it once, and shows its answer; exit
-code 0 if it succeeded. A refused request is never repeated: between two of them a pilot may
-have taken over.
+The command waits for the service, at most ``--timeout``, calls the service once, and prints the
+answer; the exit code is 0 if the call succeeded. A refused request is never repeated, because a
+pilot may have taken over meanwhile.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ def patience(service: str) -> float:
     """
     Return how long to wait for the answer of a service, s: longer than the service needs.
 
-    A take-off waits for the offboard mode first on ArduPilot, then for the climb.
+    A take-off waits for the climb; on ArduPilot it first waits for the offboard mode.
     """
     climb = TAKEOFF_DELAY + _HEIGHT / SLOWEST_CLIMB if service.endswith('takeoff') else 0.0
     return LONGEST + climb + MARGIN
 
 
 def proposal(service: str, there: Iterable[str]) -> str:
-    """Return the text "did you mean ...?", or ''; ``there`` are the full names of the services."""
+    """Return the text "did you mean ...?", or ''; ``there`` has the full names of all services."""
     last = service.rpartition('/')[2]
     known = {*there, *OUR_SERVICES}
     meant = sorted(name for name in known if name.rpartition('/')[2] == last and name != service)

@@ -15,9 +15,9 @@
 """
 The steps of a flight by the command ``follow``: which request is due, and which key confirms it.
 
-The steps are arm, takeoff, offboard, engage; land at the end. The step that is due is the first
-one whose result the nodes do not report: a step that is reached already is left out, and after a
-takeover offboard is due again. No function reads a clock; times are s, monotonic.
+The steps are arm, takeoff, offboard, engage; land at the end. The first step whose result the
+nodes do not report is due: steps that are done already are skipped, and after a takeover offboard
+is due again. No function reads a clock; times are s, monotonic.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Reports:
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
 
     def flag(self, node: str, key: str) -> bool | None:
-        """Return a value that is true or false, None if it is unknown."""
+        """Return a value of diagnostics as True or False, None if it is unknown."""
         return read_flag(self.nodes[node][1], key) if node in self.nodes else None
 
     def missing(self, since: float) -> list[str]:
@@ -94,13 +94,13 @@ class Reports:
 
     @property
     def vehicle_known(self) -> bool:
-        """Return whether the bridge and its later diagnostics know the vehicle."""
+        """Return whether the bridge's state, and later its diagnostics, describe the vehicle."""
         return parse(self.bridge).name != NO_AUTOPILOT and None not in (
             self.flag('mavlink_bridge', ARMED), self.flag('mavlink_bridge', FLYING))
 
     @property
     def streams(self) -> bool:
-        """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
+        """Return whether the bridge sends setpoints, or sent them when the autopilot was lost."""
         return parse(self.bridge).last_known.name in (READY, ACTIVE)
 
     def due(self) -> str:
@@ -112,7 +112,7 @@ class Reports:
         return next((step for step, done in reached.items() if not done), '')
 
     def line(self, now: float) -> str:
-        """Return the live line: states, the age of an old one, distance, battery, reasons."""
+        """Return the live line: states (with their age if old), distance, battery, reasons."""
         received, distance = self.distance
         word, _, why = self.bridge.partition(': ')
         reasons = '; '.join(filter(None, [why, self.value('planner', 'reason')]))
@@ -129,12 +129,12 @@ class Reports:
 
 class Flight:
     """
-    Decides which requests to make; a method returns those to make now, keys of ``SERVICES``.
+    Decides on requests; a method returns the requests to make now, keys of ``SERVICES``.
 
-    :param confirm: whether a key confirms each step. If not, each step is requested once, and a
+    :param confirm: whether a key confirms each step; if not, each step is requested once, and a
         refusal ends the flight.
-    :param ready: False if ``check`` forbids a flight: then it only lands or hands over, for which
-        the bridge alone is needed.
+    :param ready: False if ``check`` forbids a flight: then the only requests are to land or to
+        hand over, which need only the bridge.
     """
 
     def __init__(self, now: float, confirm: bool = True, ready: bool = True) -> None:
@@ -181,7 +181,7 @@ class Flight:
         return []
 
     def press(self, key: str, reports: Reports) -> list[str]:
-        """Take a key: the key of the step that is due confirms it; l lands at any step."""
+        """Take a key: the key of the due step confirms this step; l lands at any step."""
         if self._ending is not None:
             return []
         airborne = reports.flag('mavlink_bridge', FLYING) is not False
@@ -212,11 +212,11 @@ class Flight:
         """
         Brake and hand over, then end with an exit code.
 
-        The mode of the autopilot is left alone unless the bridge sends setpoints, or a take-off
-        or offboard was requested and is not answered yet: a pilot may be flying. A landing goes
-        on.
+        The mode of the autopilot is changed only if the bridge sends setpoints, or if a take-off
+        or offboard was requested and not answered yet: otherwise a pilot may be flying. A landing
+        continues.
 
-        :param insist: whether a second call ends at once, without the answers.
+        :param insist: whether a second call ends at once, without waiting for the answers.
         """
         if self._ending is not None:
             self.code = self._ending if insist else self.code

@@ -15,10 +15,10 @@
 """
 The flock node: followers exchange their own states and the states of the neighbors they see.
 
-Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share. Publishes
-on the latter, at 10 Hz, the ego state and the neighbors in sight, and on ``neighbors/heard`` the
-neighbors that others reported and that are out of sight, in the ego odometry frame. The
-mathematics is in ``flock_follower.flock``.
+The node subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share. It
+publishes at 10 Hz: on ``/neighbors/shared`` the ego state and the neighbors in sight; on
+``neighbors/heard`` the neighbors that are out of sight and that others reported, in the ego
+odometry frame. The mathematics is in ``flock_follower.flock``.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ SPECS = [
 
 
 class SharingNode(FlockNode):
-    """Passes messages to the core and back, and reports those that are not used."""
+    """Passes messages to and from the core, and reports messages that are not used."""
 
     def __init__(self, name: str = 'flock', **kwargs: Any) -> None:
         super().__init__(name, **kwargs)

@@ -15,21 +15,22 @@
 """
 The MAVLink bridge node: commands and odometry in, a stream of setpoints out.
 
-A new command is sent at once; without one the stream goes on at ``stream_rate`` (20 Hz).
+A new command is sent at once; without a command setpoints are sent at ``stream_rate`` (20 Hz).
 
-Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's ground station
-``planner/state`` and ``planner/distance``; publishes ``mavlink/odom``, ``mavlink/battery``,
-``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
-``offboard``, ``takeoff`` and ``land``.
-``flock_follower.gate`` decides which setpoints are sent.
+The node subscribes ``command/trajectory`` and ``odom``, and for the reports to the pilot's ground
+station ``planner/state`` and ``planner/distance``. It publishes ``mavlink/odom``,
+``mavlink/battery``, ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, and serves
+``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``. ``flock_follower.gate`` decides
+which setpoints are sent.
 
-Odometry is taken ODOM_RATE times a second, with all messages since the last time: a callback for
-each message of a fast source would cost more than the rest of the bridge.
+The messages of odometry are read together, ODOM_RATE times a second: a callback for each message
+of a fast source would cost more than the rest of the bridge.
 
-Three threads. ``SetpointThread`` owns the bridge and sends the setpoints on the monotonic clock:
-it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's thread
-takes messages and service calls, and passes actions to the bridge by ``SetpointThread.submit``.
-The publisher thread publishes and logs the messages that ``PublisherThread.submit`` passes to it.
+The node has three threads. ``SetpointThread`` owns the bridge and sends the setpoints on the
+monotonic clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The
+executor's thread takes messages and service calls, and passes actions to the bridge by
+``SetpointThread.submit``. The publisher thread publishes and logs what ``PublisherThread.submit``
+passes to it.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@
 """
 Listen for some seconds to every topic that a follower needs: the observations for ``check``.
 
-The observer publishes nothing and sets nothing; it requests the parameters of our nodes.
+The observer publishes nothing, sets no parameter, and reads the parameters of our nodes.
 """
 
 from __future__ import annotations
@@ -96,8 +96,9 @@ class Observer(Node):
     """
     Listens, and fills observations.
 
-    :param remaps: of our topics; others have their names in relative_pose, if it runs.
-    :param camera: the one of several to observe; '': the first.
+    :param remaps: of our topics; topics without a remap have their names from relative_pose, if it
+        runs.
+    :param camera: the camera to observe if there are several; '': the first.
     """
 
     def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],

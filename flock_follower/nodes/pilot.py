@@ -67,7 +67,7 @@ class Pilot(Node):
     Flies by keys.
 
     :param confirm: False: no keys (``--yes``), for an autopilot on this machine only.
-    :param ready: False if ``check`` forbids a flight: it only lands or hands over.
+    :param ready: False if ``check`` forbids a flight: then the node only lands or hands over.
     """
 
     def __init__(self, namespace: str, confirm: bool, ready: bool) -> None:

@@ -15,16 +15,16 @@
 """
 The planner node: odometry and neighbors in, one acceleration command per tick out.
 
-Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and if published ``camera_info``,
-``neighbors/acceleration``, ``neighbors/heard`` (neighbor states received from other vehicles)
-and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
-steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``planner/distance`` (to
-the neighbor that it faces, else the nearest; its name is the frame). Commands come while it is
-engaged (service ``planner/engage``) and the bridge reports on ``mavlink_bridge/state`` that it
-flies them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
-disengages it. After ``resume_timeout`` without a neighbor the commands end. Both last until
-``planner/engage`` is called again. The decisions are made in
-``flock_follower.planner.step``.
+The node subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and if they are published
+``camera_info``, ``neighbors/acceleration``, ``neighbors/heard`` (neighbor states received from
+other vehicles) and ``mavlink_bridge/armed_at``. It publishes ``command/trajectory`` at 10 Hz (on a
+steady clock; with ``use_sim_time`` on ``/clock``), ``planner/state``, and ``planner/distance`` to
+the faced neighbor, else to the nearest (``frame_id`` is the neighbor's name).
+
+The node commands while it is engaged (service ``planner/engage``) and ``mavlink_bridge/state``
+reports that the bridge flies the commands; with ``require_bridge`` false, while it is engaged.
+The commands end if a pilot takes over, and after ``resume_timeout`` without a neighbor, until
+``planner/engage`` is called again. ``flock_follower.planner.step`` makes the decisions.
 """
 
 from __future__ import annotations

@@ -15,16 +15,17 @@
 """
 The perception node: images and ego odometry in, the neighbors' states out.
 
-Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
-calibration of each of several cameras (parameter ``cameras``), or the poses of other detectors
-(``pose_topic``, ``tf_frame`` and ``frames_topic`` of the neighbors' file); publishes
-one ``neighbors`` and one ``neighbors/acceleration`` message per neighbor measured in an image,
-stamped like the image; the measured pose of NAME in the camera's optical frame as
-``neighbors/NAME/pose``; its pose in the frame of ``odom`` on ``/tf`` if tf2_msgs is installed; the
-same as NAME/duplicate for another object with the marker of NAME,
-``neighbors/frames`` for every image processed, with or without a neighbor,
-and, while ``~/debug_image`` has a subscriber, every image with the measurements drawn in (of
-several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
+The node subscribes ``odom``, ``image_raw`` (or ``image_raw/compressed``) and ``camera_info``; with
+several cameras (parameter ``cameras``) the images and calibration of each; with other detectors
+their poses (``pose_topic``, ``tf_frame`` and ``frames_topic`` of the neighbors' file).
+
+For each neighbor measured in an image the node publishes, with the stamp of the image,
+``neighbors``, ``neighbors/acceleration``, the measured pose in the camera's optical frame as
+``neighbors/NAME/pose``, and on ``/tf`` the pose in the frame of ``odom`` if tf2_msgs is installed.
+A second object with the marker of NAME has the name NAME/duplicate. ``neighbors/frames`` has one
+message for each processed image, with or without a neighbor. While ``~/debug_image`` (with several
+cameras ``~/debug_image/NAME``) has a subscriber, the node draws the measurements into each image.
+The mathematics is in ``flock_follower.perception``.
 """
 
 from __future__ import annotations

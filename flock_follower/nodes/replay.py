@@ -15,10 +15,10 @@
 """
 Replay a bag: ``replay BAG [--ros-args -p rate:=2.0 -p loop:=true ...]``.
 
-Plays ROS 1, ROS 2 sqlite3 and MCAP bags on their recorded schedule, with ``/clock``; gaps of more
-than 5 s in it are named and left out. A bag's
-absolute topics are published under relative names (``/odom`` as ``odom``), so namespaces and
-remaps apply. The service ``replay/pause`` (std_srvs/SetBool) stops and resumes, clock included.
+The node plays ROS 1, ROS 2 sqlite3 and MCAP bags at the recorded times, with ``/clock``; gaps of
+more than 5 s are reported and skipped. Absolute topics of a bag are published under relative names
+(``/odom`` as ``odom``), so namespaces and remaps apply. The service ``replay/pause``
+(std_srvs/SetBool) stops and resumes messages and clock.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Replay(FlockNode):
     """
     Publish the messages of a bag when they fall due.
 
-    :raises ValueError: a bad parameter, or a bag that cannot be played (BagError).
+    :raises ValueError: for a bad parameter, or a bag that cannot be played (BagError).
     """
 
     def __init__(self, bag: str = '') -> None:

@@ -15,9 +15,9 @@
 """
 The view node: a live page of the flight for a browser, http://127.0.0.1:8090.
 
-It reads topics; it commands nothing unless ``control:=true``. Names of topics, and the mounting of
-the camera, are those of relative_pose, which is asked for its parameters. Without an open page the
-node takes, once per second, the few messages that the history on the page needs. With one it also
+The node only reads topics, unless ``control:=true``. It reads the names of topics, and the
+mounting of the camera, from the parameters of relative_pose. Without an open page the node takes,
+once per second, the few messages that the history on the page needs. With an open page it also
 takes odometry, neighbors, commands, and images of the (first) camera, and draws at 10 Hz.
 """
 

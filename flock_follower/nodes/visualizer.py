@@ -15,9 +15,9 @@
 """
 The visualizer node: the flight as markers for RViz and Foxglove.
 
-Publishes ``visualizer/markers`` in the frame of ``odom`` while a viewer subscribes: the follower
-with its state and command, and each neighbor with its velocity, the ellipsoid of its position and
-the planner's band about it. No other node waits for it.
+While a viewer subscribes, the node publishes ``visualizer/markers`` in the frame of ``odom``: the
+follower with its state and command, and each neighbor with its velocity, the ellipsoid of its
+position, and the planner's band about it. No other node waits for this node.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class Visualizer(FlockNode):
 
 
 def to_marker(shape: Shape) -> Marker:
-    """Return the marker of a shape; its name is the namespace, so that each can be hidden."""
+    """Return the marker of a shape; its namespace is the shape's name, so each can be hidden."""
     red, green, blue, opacity = COLORS[shape.paint]
     marker = Marker(ns=shape.name, type=KINDS[shape.kind], action=Marker.ADD, text=shape.text,
                     lifetime=Duration(seconds=LIFETIME).to_msg(),

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Odometry of any source as one normalized own state; its history, interpolated to a stamp."""
+"""Odometry of any source, converted to the state of base_link; its history at any stamp."""

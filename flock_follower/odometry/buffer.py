@@ -15,13 +15,12 @@
 """
 The recent own odometry, interpolated to the stamp of an image.
 
-A position from visual-inertial odometry is noisy and jumps with every correction; a measured
-velocity does not. The buffer therefore keeps a second position, ``travel``, the integral of the
-velocity: detections relative to it move smoothly, and ``position - travel`` takes them back to
-odom.
+The position of visual-inertial odometry is noisy, and jumps with every correction; a measured
+velocity does not jump. So the buffer also keeps ``travel``, the integral of the velocity. Relative
+to ``travel`` detections move smoothly; adding ``position - travel`` converts them to odom.
 
-Attitude noise moves distant detections sideways. The angular velocities carry the attitudes of
-the last few samples to the stamp, where they are averaged.
+Attitude noise moves distant detections sideways. So the attitudes of the last few samples are
+extrapolated to the stamp by the angular velocities, and averaged.
 """
 
 from __future__ import annotations
@@ -61,8 +60,9 @@ class OdometrySample(NamedTuple):
 
     ``position`` (3,), m, and ``velocity`` (3,), m/s, in odom; ``quaternion`` (x, y, z, w) takes
     the body (FLU) to odom; ``angular_velocity`` (3,), rad/s, is in the body. ``travel`` (3,), m,
-    is the integral of the velocity since the buffer began, set by the buffer. ``derived``: the
-    velocity comes from the positions, and so adds nothing to them.
+    is the integral of the velocity since the beginning of the buffer; the buffer sets it.
+    ``derived``: whether the velocity was derived from the positions, so that it has no new
+    information.
     """
 
     stamp: float
@@ -157,9 +157,9 @@ class OdometryBuffer:
 
     def add(self, sample: OdometrySample) -> bool:
         """
-        Remember a sample; return whether time jumped back, and so all others were forgotten.
+        Add a sample; return whether time jumped back, so that all other samples were forgotten.
 
-        A sample that is only late, or a repetition, is ignored.
+        A late sample, and a repetition, are ignored.
         """
         newest = self.newest
         jumped = newest is not None and sample.stamp <= newest
@@ -200,8 +200,9 @@ class OdometryBuffer:
         """
         Return the state at a stamp, s, or the reason why it is missing.
 
-        Between two samples velocities are linear, and position and attitude go along with them;
-        past the newest, its velocities carry on for at most ``MAX_EXTRAPOLATION``.
+        Between two samples velocities are interpolated linearly, and position and attitude follow
+        from them. After the newest sample its velocities are kept, for at most
+        ``MAX_EXTRAPOLATION``.
         """
         after = self._find_sample(stamp, extrapolate)
         if isinstance(after, Missing):
@@ -216,7 +217,7 @@ class OdometryBuffer:
         """
         Return points (n, 3) on the body in the smooth frame, (k, n, 3), for stamps (k, n), s.
 
-        Between two samples position and attitude are linear. None if a stamp is not covered.
+        Position and attitude are interpolated linearly. None if there is no odometry for a stamp.
         """
         held = self._rows[:, 0]
         if not len(held) or not held[0] <= stamps.min() <= stamps.max() <= held[-1]:
@@ -237,7 +238,7 @@ class OdometryBuffer:
                          pz + t + twice * (x * b - y * a)], axis=-1)
 
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
-        """Return why :meth:`at` would give no state, or None."""
+        """Return why :meth:`at` would return no state, or None."""
         after = self._find_sample(stamp, extrapolate)
         return after if isinstance(after, Missing) else None
 
@@ -264,8 +265,9 @@ class OdometryBuffer:
         """
         Return a state of :meth:`at` with the attitude averaged over the last ``STEADY`` seconds.
 
-        That is done only if the angular velocities take one attitude to the next: see
-        :meth:`_agree`. Attitudes that are off by more than their noise do not count.
+        The attitude is averaged only if the angular velocities explain the change from each
+        attitude to the next, see :meth:`_agree`. An attitude that differs from the others by more
+        than the noise is not used.
         """
         end = self._index_after(state.stamp, 'right')
         first = max(self._index_after(state.stamp - self.STEADY, 'left'), end - self.AVERAGED)
@@ -325,7 +327,7 @@ class OdometryBuffer:
 
 
 def interpolate(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
-    """Return the state at a stamp, s, between two samples: as :class:`OdometryBuffer` has it."""
+    """Return the state at a stamp, s, between two samples, as in :class:`OdometryBuffer`."""
     return _interpolate(a.row(a.position), b.row(b.position), stamp)
 
 

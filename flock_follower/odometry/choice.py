@@ -23,7 +23,7 @@ RELATIVE_SILENCE = 0.15
 
 
 class OdometryChoice:
-    """Selects the odometry to use: that in the frame ``RELATIVE`` while it is received."""
+    """Selects the odometry to use: the one in the frame ``RELATIVE`` while it is received."""
 
     def __init__(self) -> None:
         self._newest: int | None = None

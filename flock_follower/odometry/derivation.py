@@ -15,24 +15,23 @@
 """
 Velocities derived from positions, and angular velocities from attitudes.
 
-The same Kalman filter serves both: value, rate and acceleration along each axis, driven by white
+Both use the same Kalman filter: value, rate and acceleration along each axis, driven by white
 jerk (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
 section 6.2). The measurement noise is learned from the innovations.
 
-Frame of a source's velocity, found by a comparison with the motion of its positions.
+``TwistFrame`` finds the frame of a source's velocity. REP-105 requires the child frame; some
+sources use the header's frame, others send no velocity or a wrong velocity. The velocity is read
+in both frames. In windows of ``WINDOW`` seconds the mean velocity of each reading is compared with
+the displacement. If the readings differ (with yaw 0 they do not), the evidence is added up over
+the windows until one frame is certain. If both readings contradict the displacement in
+``AGREEING_WINDOWS`` successive windows, at any time, the velocity is not used any more. It is used
+again once a reading agrees in as many windows in motion, or in ``EXPIRES`` windows at rest.
 
-REP-105 specifies the child frame. Some sources use the header's frame, others send no velocity, or
-a wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
-the displacement. The evidence for one reading adds up, window by window, if the readings differ
-(with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING_WINDOWS`` in a row, at
-first or later, the velocity is dropped. The velocity is used again once it agrees in as many
-windows in motion, or in ``EXPIRES`` windows at rest.
-
-Before the frame is found, REP-105's child frame is used while both readings are the same, and the
-likelier reading once the evidence favors one. Otherwise the velocity is derived from the
-positions, as it is while the last window contradicts both readings, and after a contradiction
-until a frame is found again. A velocity of exactly 0 counts as missing. The covariance of the
-twist includes the probability that the reading is wrong.
+Before the frame is found, the child frame is used while both readings are equal, and the more
+likely reading once the evidence favors it. The velocity is derived from the positions in all other
+cases: while the last window contradicts both readings, and after a contradiction until a frame is
+found again. A velocity of exactly 0 counts as missing. The covariance of the twist includes the
+probability that the reading is wrong.
 """
 
 from __future__ import annotations
@@ -146,15 +145,15 @@ class DerivedVelocity(_WhiteJerk):
         return self.VARIANCE_FACTOR * self._covariance[3]
 
     def velocity_at(self, stamp: float) -> Array:
-        """Return the velocity (3,), m/s, at a stamp, s, soon after the newest position."""
+        """Return the velocity (3,), m/s, at a stamp, s, shortly after the newest position."""
         return self.rate + (stamp - self.stamp) * self.acceleration
 
     def take(self, stamp: float, position: Array) -> float:
         """
-        Take a position; return the size of its jump, m, else 0.
+        Take a position; return the size of its jump, m, or 0 without a jump.
 
         Only positions are compared, because not every source has a reliable velocity. ``check``,
-        ``evaluate`` and the diagnostics count and report this jump.
+        ``evaluate`` and the diagnostics count and report these jumps.
         """
         dt = stamp - self.stamp
         if not 0.0 < dt <= ODOMETRY_GAP:
@@ -253,7 +252,7 @@ class TwistFrame:
     """
     Determines the frame of a source's velocity, ``frame``: 'child', 'odom', or 'none'.
 
-    :param wanted: one of these, which is then obeyed, or 'auto'.
+    :param wanted: a frame, which is then used, or 'auto'.
     """
 
     def __init__(self, wanted: str = AUTO) -> None:
@@ -279,7 +278,7 @@ class TwistFrame:
         return (self.found or NONE) if self.wanted == AUTO else self.wanted
 
     def reading(self, child: Array, odom: Array) -> str:
-        """Return the frame to use for a velocity, given its value in both frames (3,), m/s."""
+        """Return the frame to use for a velocity, from its value (3,), m/s, in both readings."""
         if self.wanted != AUTO or self.found:
             return self.frame
         if self.failing or self.contradiction or not child.any():
@@ -303,7 +302,7 @@ class TwistFrame:
         return f'{self.wanted}: {self.found or "not known yet"} by the positions{off}'
 
     def restart(self) -> None:
-        """Begin a new window: the position jumped, or there was a gap."""
+        """Begin a new window, because the position jumped, or there was a gap."""
         self._last: _Numbers | None = None
         self._begin()
 
@@ -312,7 +311,7 @@ class TwistFrame:
         self._piece: _Numbers = _EMPTY_PIECE
 
     def take(self, stamp: float, position: Array, child: Array, odom: Array) -> None:
-        """Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways."""
+        """Take a position (3,), m, and the velocity in odom, m/s, by both readings."""
         now = (stamp, *position.tolist(), *child.tolist(), *odom.tolist())
         last, self._last = self._last, now
         if last is None:

@@ -13,16 +13,16 @@
 # limitations under the License.
 
 """
-Odometry of any source as the vehicle's own state: the pose of base_link, with a velocity.
+Odometry of any source as the ego state: pose and velocity of base_link.
 
 Sources differ (see docs/sensors.md): their child frame is an IMU or a camera instead of base_link;
 their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
-their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
+their covariances are zero. Every node reads ``odom`` by ``OdometrySource``.
 
-``read_odometry`` reads a message from its bytes on the wire in 5 us; rclpy takes 85 us, rosbags
-15 us, and a fast source sends 200 a second to every node. The bytes are CDR (OMG DDS-RTPS 9.4.2,
-"classic"): 4 that contain the byte order, then every number aligned to its size, counted from
-there; a string is its length with the closing zero, and itself.
+``read_odometry`` reads a message from its bytes in 5 us; rclpy takes 85 us, rosbags 15 us, and a
+fast source sends 200 messages a second to every node. The bytes are CDR (OMG DDS-RTPS 9.4.2,
+"classic"). The first 4 bytes contain the byte order. After them, every number is aligned to its
+size. A string is its length, including the final zero, and its bytes.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ class SourceParams(Checked):
     """
     Parameters of the odometry source.
 
-    ``child_position`` (3), m, and ``child_rpy`` (3), rad, are the pose of its child frame on
-    base_link (FLU); ``twist_frame`` is the frame of its velocity, or 'auto'. ``std`` (4) are the
-    standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
-    if a message has no covariance.
+    ``child_position`` (3), m, and ``child_rpy`` (3), rad, are the pose of the odometry's child
+    frame on base_link (FLU); ``twist_frame`` is the frame of the velocity, or 'auto'. ``std`` (4)
+    are the standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity,
+    rad/s, for a message without covariance.
     """
 
     child_position: tuple[float, ...] = parameter(
@@ -119,9 +119,9 @@ class OdometrySource:
     """
     The ego odometry, message by message.
 
-    ``twist`` describes the frame of the velocity.
-    ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
-    ``placement`` is the newest placement of the child frame by ``static``, as text.
+    ``twist`` describes the frame of the velocity. ``events`` has a pair (reason, detail) for each
+    dropped message and each jump since :meth:`new_events`. ``placement`` is the newest placement
+    of the child frame by ``static``, as text.
 
     :param static: frames that place the child frame of each message on base_link, unless
         ``params`` place it. Frames may be added later.
@@ -179,12 +179,12 @@ class OdometrySource:
 
     @property
     def latency(self) -> float:
-        """Return the longest recent time from a stamp to its arrival, s; 0 before the first."""
+        """Return the longest recent time from stamp to arrival, s; 0 before the first message."""
         return max(self._latencies, default=0.0)
 
     @property
     def period(self) -> float:
-        """Return the longest recent time between two stamps, s; 0 before the second."""
+        """Return the longest recent time between two stamps, s; 0 before the second message."""
         return max(self._gaps, default=0.0)
 
     def new_events(self) -> list[tuple[str, str]]:
@@ -196,9 +196,9 @@ class OdometrySource:
         """
         Return the ego state, of base_link, from an Odometry message that arrived at ``now``, ns.
 
-        None if it is a repetition or out of order. A zero stamp means now.
+        None if the message is a repetition or out of order. A stamp of 0 means ``now``.
 
-        :param clock_shift: by how much its stamp is ahead of the clock of ``now``, ns: see
+        :param clock_shift: by how much the stamp is ahead of the clock of ``now``, ns: see
             ``nodes.support.clock_watch``.
 
         :raises ValueError: if position, attitude or stamp is invalid.
@@ -369,7 +369,7 @@ def _is_correlated(matrix: Array) -> bool:
 
 def read_odometry(data: bytes) -> Any:
     """
-    Return an Odometry message from its bytes; the covariances (36,) are views of them.
+    Return an Odometry message from its bytes; the covariances (36,) are views of the bytes.
 
     :raises ValueError: if the bytes are no Odometry message.
     """

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Parameters of the nodes: declaration, checks and files. Each room holds its own tables."""
+"""Parameters of the nodes: declaration, checks and files. Each folder has its own tables."""

@@ -15,8 +15,9 @@
 """
 The parameters of the cameras.
 
-One camera needs no name. Several are listed in ``cameras``, and each has parameters of its own
-below ``camera.NAME``; planner, relative_pose and black_box take the same ones.
+A single camera needs no name. Several cameras are listed in ``cameras``, and each has its
+parameters below ``camera.NAME``; planner, relative_pose and black_box have the same parameters of
+cameras.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ ALONE: Final[Mapping[str, tuple[str, Any]]] = {
 
 
 class CameraValues(NamedTuple):
-    """The parameters of one camera; its name is '' if there is no other."""
+    """The parameters of one camera; the name of a single camera is ''."""
 
     name: str
     image: str = 'image_raw'
@@ -85,8 +86,8 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     """
     Return the cameras in the checked values of a node's parameters.
 
-    :raises ValueError: if a topic is none, if two cameras share a name or a topic, or if a
-        parameter of a single camera is set beside several cameras.
+    :raises ValueError: if a name of a topic is invalid, if two cameras share a name or a topic, or
+        if a parameter of a single camera is set although there are several cameras.
     """
     names = [name for name in values[NAMES] if name]
     if not names:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The differences of two sets of parameters, in words."""
+"""The differences between two sets of parameters, as text."""
 
 from __future__ import annotations
 

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-Reads whole parameter files: the checked values of the parameters of several nodes.
+Reads complete parameter files: the checked values of the parameters of several nodes.
 
-No node that flies loads this module; each reads its sections by ``parameters.sections``.
+No node that flies loads this module; each node reads its sections by ``parameters.sections``.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | Non
     """
     Return the values in the file beside a recording of the black box; None without a file.
 
-    A neighbors' file that they name is looked for beside the recording, too.
+    If the values name a neighbors' file, it is also searched beside the recording.
 
     :raises ValueError, OSError: see :func:`read_parameters`.
     """
@@ -85,8 +85,9 @@ def effective_parameters(paths: Sequence[str | Path], given: Mapping[str, Any], 
     """
     Return the checked values with which a node starts, defaults included.
 
-    :param paths: its parameter files; the last setting wins, as in ROS. :param given: parameters
-        set beside them, which win. :param node: its full name. :param specs: of its parameters.
+    :param paths: the node's parameter files; the last setting wins, as in ROS. :param given:
+        parameters that override the files. :param node: its full name. :param specs: of its
+        parameters.
     :raises ValueError: naming the parameter, its value and the valid range, or the file.
     :raises OSError: if a file cannot be read.
     """

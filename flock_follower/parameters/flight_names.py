@@ -13,9 +13,10 @@
 # limitations under the License.
 
 """
-The names of the parameters of relative_pose, planner and mavlink_bridge; test_tables holds them.
+The names of the parameters of relative_pose, planner and mavlink_bridge, as test_tables checks.
 
-A node refuses an unknown name in a section that all three read, and loads no table but its own.
+With these names a node refuses an unknown name in a section that all three nodes read, without
+the tables of the other nodes.
 """
 
 from __future__ import annotations

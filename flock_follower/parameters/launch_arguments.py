@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The arguments of launch files: unknown names are refused."""
+"""Refuses unknown arguments of launch files."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def refuse_arguments(command_line: Sequence[str], file: str, known: Collection[s
     it may have arguments of its own.
 
     :param command_line: ``sys.argv``.
-    :param file: path of the launch file; :param known: names of its arguments, and of those of
-        the files that it includes.
-    :raises ValueError: naming the argument, and the name that is nearest to it.
+    :param file: path of the launch file; :param known: names of its arguments, and of the
+        arguments of the files that it includes.
+    :raises ValueError: naming the argument, and the most similar known name.
     """
     if not any(Path(word).name == Path(file).name for word in command_line):
         return

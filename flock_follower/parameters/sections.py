@@ -16,9 +16,9 @@
 ROS 2 parameter files, read without ROS.
 
 A file maps names of nodes to their parameters, under ``ros__parameters``. The section ``/**`` is
-for every node; if it and the section of a node set one parameter, the last one in the file wins,
-as in rcl. A name under ``/**`` must be a parameter of one of the nodes, not of all: each node
-takes those that it has.
+for every node; if this section and the section of a node set the same parameter, the last setting
+in the file wins, as in rcl. A name under ``/**`` must be a parameter of at least one node: each
+node takes the parameters that it has.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _FORMER_SHARED = 'follower'
 
 def names_for_any_node(paths: Sequence[str | Path], node: str, specs: Sequence[Spec]) -> set[str]:
     """
-    Return the parameters that sections such as ``/**`` set for a node, whether it has them or not.
+    Return all parameters that sections such as ``/**`` set for a node, known to it or not.
 
     :param node: the node's full name, as '/drone1/planner'. :param specs: of its own parameters.
     :raises ValueError: naming the file and its fault, such as a name that no node knows.
@@ -68,7 +68,7 @@ def names_for_any_node(paths: Sequence[str | Path], node: str, specs: Sequence[S
 
 
 def listed_files(files: Sequence[str]) -> str:
-    """Return the parameter files of nodes with one name as text; '' is a node without one."""
+    """Return the parameter files of nodes with the same name as text; '' is a node without."""
     return ' and '.join(f'with {each or "no file"}' for each in files)
 
 
@@ -88,8 +88,8 @@ def ignored_sections(path: str | Path, node: str) -> str:
     Return a warning about sections that ROS will not apply to a node; '' if there are none.
 
     :param node: the node's full name, as '/drone1/planner'.
-    :raises ValueError: if no section is for the node, but one has its name in another namespace,
-        or nearly its name; or if the file is no YAML.
+    :raises ValueError: if no section is for the node, but one section has its name in another
+        namespace, or a similar name; or if the file is no YAML.
     :raises OSError: if the file cannot be read.
     """
     with naming(path):
@@ -130,8 +130,8 @@ def read_sections(document: Any) -> list[tuple[str, dict[str, Any]]]:
     """
     Return the full names of the nodes, or their patterns, with their parameters.
 
-    :raises ValueError: for a value that is not below ros__parameters: ROS takes no such file;
-        for a section ``follower``: ``/**`` has replaced it.
+    :raises ValueError: if a value is not below ros__parameters, because ROS refuses such a file;
+        if there is a section ``follower``, which ``/**`` has replaced.
     """
     sections = [*_find_sections('', document)]
     for section, _ in sections:

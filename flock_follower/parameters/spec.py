@@ -66,9 +66,9 @@ class Spec:
     One parameter: its name, default, meaning and valid values.
 
     The type of ``default`` is the parameter's type; integers are accepted for a float. ``valid``
-    is the range of a number, or of each of a list, or the choices of a text. With ``fixed_length``
-    a list must be as long as its default. A node takes new values of ``live`` parameters in
-    flight, of others at start only.
+    is the range of a number or of each number in a list, or the choices of a text. With
+    ``fixed_length`` a list must be as long as its default. ``live`` parameters can be changed in
+    flight, others only at the start.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Spec:
     live: bool = False
 
     def named(self, name: str) -> Spec:
-        """Return the declaration for the camera of a name."""
+        """Return the declaration for the camera with a name."""
         default = self.default
         if isinstance(default, str):
             default = default.replace(EACH, name)
@@ -87,7 +87,7 @@ class Spec:
 
     @cached_property
     def range(self) -> Range:
-        """Return the values that a number, or each of a list, may take."""
+        """Return the valid values of a number, or of each number in a list."""
         valid = self.valid if isinstance(self.valid, Range) else Range()
         return replace(valid, whole=True) if isinstance(self.default, int) else valid
 
@@ -110,7 +110,7 @@ class Spec:
 
     def check(self, value: Any) -> Value:
         """
-        Return the value in the parameter's type.
+        Return the value, converted to the parameter's type.
 
         :raises ValueError: naming the parameter, the value and the valid range.
         """
@@ -169,7 +169,7 @@ def filled(params: P, values: Mapping[str, Any], prefix: str = '', **others: Any
 
     :param prefix: as in :func:`specs_of`.
     :param others: fields that are no parameters of a node.
-    :raises ValueError: for values that are invalid, or do not fit together.
+    :raises ValueError: for values that are invalid, or contradict each other.
     """
     changes = dict(others)
     for each in fields(params):  # type: ignore[arg-type]
@@ -227,7 +227,7 @@ def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> N
     """
     Refuse names that are no parameters of a node: ROS would ignore these names.
 
-    :raises ValueError: naming the parameter, and the one that is nearest to it.
+    :raises ValueError: naming the parameter, and the most similar known name.
     """
     for name in sorted(names):
         if name in known or name in OF_EVERY_NODE or name.startswith('qos_overrides.'):

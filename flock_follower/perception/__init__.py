@@ -15,5 +15,5 @@
 """
 Finds the neighbors in images: camera model, markers, edges, poses, and a filter per neighbor.
 
-The only room of those that fly which uses cv2.
+Of the folders that fly, only this one uses cv2.
 """

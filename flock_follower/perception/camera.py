@@ -29,9 +29,9 @@ With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (
 - equidistant (fisheye), D = (k1, k2, k3, k4): t = atan r,
   (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
 
-The models are written out here, not taken from cv2, because its undistortion stops early, its
-accuracy option moved between OpenCV 4 and 5, and its fisheye functions order their Jacobians
-otherwise.
+The models are implemented here, not taken from cv2: cv2's undistortion stops before it has
+converged, its option for accuracy differs between OpenCV 4 and 5, and the Jacobians of its fisheye
+functions have another order.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ _RADIUS_LIMIT = 10.0
 
 
 def off_center(shares: Array) -> bool:
-    """Return whether the optical axis, as shares (2,) of the image size, is far off the middle."""
+    """Return whether the optical axis, as shares (2,) of the image size, is far off-center."""
     return bool(np.abs(shares - 0.5).max() > MAX_AXIS_OFFSET)
 
 
 def marked_rectified(topic: str) -> bool:
-    """Return whether a topic's name marks its images as rectified, for any transport."""
+    """Return whether the name of a topic says that its images are rectified, for any transport."""
     return bool({'rect', 'rectified'}.intersection(re.split('[/_]', topic.lower())))
 
 
@@ -79,8 +79,8 @@ class CameraModel:
     ``radius`` is the radius in normalized coordinates up to which the distortion is one-to-one.
 
     :param matrix: K, shape (3, 3), px.
-    :param distortion: D; shorter is filled up with zeros if the model allows it (none at all,
-        or plumb_bob's first four), surplus zeros at the end are ignored.
+    :param distortion: D; if the model allows it (no coefficients, or plumb_bob's first four),
+        missing coefficients are zero; additional zeros at the end are ignored.
     :param model: a key of ``DISTORTION_MODELS``; empty means plumb_bob.
     :param width: image width, px.
     :param height: image height, px.
@@ -125,9 +125,9 @@ class CameraModel:
         """
         Return the camera of a calibration as ``CameraInfo`` spells it.
 
-        K is (3, 3) or flat (9,). A rectified image has been undistorted already: its camera is
-        the left (3, 3) of P, (3, 4) or flat (12,), without distortion, and poses are then in
-        the rectified frame.
+        K is (3, 3) or flat (9,). For images that are undistorted already (rectified), the camera
+        matrix is the left (3, 3) of P, (3, 4) or flat (12,), there is no distortion, and poses are
+        in the rectified frame.
 
         :raises ValueError: naming the fault of the calibration.
         """
@@ -167,8 +167,8 @@ class CameraModel:
         """
         Return the camera of a region of interest of the full image, then binned.
 
-        :param x_offset: first column of the region, full-resolution px; y_offset likewise.
-        :param width: width of the region before binning, px; height likewise.
+        :param x_offset: first column, and ``y_offset`` first row, of the region, px of the full
+            image. :param width: width, and ``height`` height, of the region before binning, px.
         :raises ValueError: if the region is not inside the image.
         """
         if (x_offset < 0 or y_offset < 0 or min(binning_x, binning_y) < 1
@@ -199,7 +199,8 @@ class CameraModel:
         """
         Return the pixels (N, 2) of points (N, 3) in the optical frame, m.
 
-        NaN if a point is behind the camera or so far aside that the distortion folds back.
+        NaN if a point is behind the camera, or so far off the axis that the distortion is not
+        one-to-one.
         """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
         return self.distort(self._normalized(p)[0])
@@ -208,7 +209,7 @@ class CameraModel:
         """
         Return the pixels (N, 2) of normalized coordinates (N, 2) = (X/Z, Y/Z).
 
-        NaN if the distortion folds back.
+        NaN if the distortion is not one-to-one there.
         """
         squares = xy * xy
         r2 = squares[:, 0] + squares[:, 1]

@@ -15,8 +15,8 @@
 """
 Decides which neighbors each camera's image is searched for, and how often whole images are.
 
-With one camera, every neighbor is looked for in every image. With several cameras, a neighbor that
-another camera has just seen is looked for only at its expected place in the image, without a
+With one camera, every neighbor is searched in every image. With several cameras, a neighbor that
+another camera has just seen is expected only at its predicted place in the image, without a
 search, and less often if it was not found there. Each of n cameras searches whole images n times
 less often, so the total cost does not grow.
 """
@@ -56,7 +56,7 @@ NEAREST = 0.05
 
 
 class Sought(NamedTuple):
-    """Names of neighbors: expected in the image, and to be searched for in the whole image."""
+    """Names of neighbors: those expected in the image, and those to search in the whole image."""
 
     near: list[str]
     anywhere: list[str]
@@ -86,7 +86,7 @@ class CameraSchedule:
         return self._seen.get(name, (camera, 0.0))[0] is camera
 
     def time(self, name: str, camera: MountedCamera, time: float) -> float:
-        """Return a time for a neighbor's filter; those of simultaneous images differ."""
+        """Return a time for a neighbor's filter; the times of simultaneous images differ."""
         last, seen = self._seen.get(name, (camera, time))
         return seen + STEP if last is not camera and abs(time - seen) < TOGETHER else time
 
@@ -109,7 +109,7 @@ class CameraSchedule:
         return sought
 
     def in_view(self, name: str, model: CameraModel, T_camera_body: Transform) -> bool:
-        """Return whether the middle of a marker is in the image, or nearly, and faces it."""
+        """Return whether the middle of a marker is in or near the image, and faces the camera."""
         to_camera, (left, top, right, bottom) = T_camera_body.rotation.T, _view_limits(model)
         places, normals = self._markers[name]
         # In plain numbers: for every image, and so small.

@@ -15,15 +15,16 @@
 """
 Fits a neighbor's pose to the edges of its markers, from a roughly known pose.
 
-Brightness profiles are taken across the known edges between black and white. The derivative of a
-profile, smoothed as widely as the image is blurred, peaks at the edge. Unlike the level half-way
-between black and white, the peak hardly moves if blur dims a narrow cell.
+Brightness is sampled across the known edges between black and white. The derivative of such a
+profile, smoothed by the blur of the image, has its peak at the edge. The half-way level between
+black and white is not used, because it moves if blur darkens a narrow white cell; the peak hardly
+moves.
 
 The fit minimizes the squared distances between edges and model, across the edges: Gauss-Newton
-with Tukey's weights, so that covered or dirty edges do not count. Gamma and over-exposure make
-white areas swell ("bloom"): all edges shift from white to black. The fit estimates this shift with
-the pose, one for edges across the marker's x axis and one for those across y, because motion blurs
-them unequally.
+with Tukey's weights, so that covered or dirty edges do not count. Gamma and over-exposure enlarge
+white areas ("bloom"): all edges shift from white to black. The fit estimates this shift together
+with the pose, separately for edges across the marker's x axis and y axis, because motion blurs
+them differently.
 """
 
 from __future__ import annotations
@@ -259,13 +260,13 @@ class EdgeFit(NamedTuple):
     """
     A pose that explains the edges.
 
-    ``pose`` is ``T_camera_body``; ``center`` (3,) is in the middle of the edges, in the camera's
-    optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
-    vector r in R_true = exp(r) R. ``rms`` is that of the residuals, px, ``chi2`` the mean of
-    their squares over their variances, ``degrees`` the degrees of freedom left;
-    ``inlier_share`` the share of edges in place. ``spacing``, px, is that of the profiles which
-    suits the blur found; ``blur`` is that, a share of the narrowest cell, and ``bloom`` the shift,
-    px, both of the axis with more.
+    ``pose`` is ``T_camera_body``; ``center`` (3,) is the middle of the edges, in the camera's
+    optical frame, m. ``covariance`` (6, 6) is the covariance of the position of ``center`` and of
+    the rotation vector r in R_true = exp(r) R. ``rms`` is the RMS of the residuals, px; ``chi2``
+    the mean of the squared residuals over their variances; ``degrees`` the remaining degrees of
+    freedom; ``inlier_share`` the share of edges in place. ``spacing``, px, is the best spacing of
+    the profiles for the blur found. ``blur``, a share of the narrowest cell, and ``bloom``, the
+    shift in px, are those of the axis with the larger value.
     """
 
     pose: Transform
@@ -293,8 +294,8 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
     More than MIN_INLIER_SHARE of the edges must be in place, within MAX_RMS. ``start`` may be off
     by half a cell of the marker in the image.
 
-    :param spacing: of the profiles, px, that suited the image before; then ``start`` may be off
-        by four times as much.
+    :param spacing: the best spacing of the profiles, px, in the image before; with it, ``start``
+        may be off by four times as much.
     """
     pose, last, share = start, None, 0.0
     bloom: Array = _NO_BLOOM

@@ -15,12 +15,12 @@
 """
 The edges of a neighbor's markers, projected to the image by a pose; normal equations.
 
-``solve_normal`` and ``normal_covariance`` serve every fit. Both solve normal equations of least
-squares by Cholesky, and only if the equations determine every unknown: Gaussian elimination also
-answers equations that only rounding keeps from being singular, and their inverse is no covariance.
+Every fit uses ``solve_normal`` and ``normal_covariance``. Both solve normal equations of least
+squares by Cholesky, and only if the equations determine every unknown. Gaussian elimination would
+also solve singular equations with rounding errors, whose inverse is no covariance.
 
-The arrays are small, so the time depends on the number of operations, not of points. ``dot`` takes
-half as long as ``@``.
+The arrays are small, so the time depends on the number of numpy calls, not on the number of
+points. ``dot`` takes half as long as ``@``.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def normal_covariance(information: Array) -> Array | None:
     """
     Return the inverse (n, n), symmetric and positive definite, of a symmetric matrix (n, n).
 
-    None if that is not positive definite, or worse conditioned than :data:`MAX_INFLATION`.
+    None if the matrix is not positive definite, or its condition is worse than
+    :data:`MAX_INFLATION`.
     """
     solved, inverse = cv2.invert(information, flags=_CHOLESKY)
     # In units in which each unknown alone has variance 1, the trace of the inverse bounds the
@@ -192,8 +193,9 @@ def profiles_across(image: GrayImage, pixels: Array, along: Array, steps: Any,
     """
     Return the brightness (n, s) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
 
-    The image's edge repeats outside. None if hardly anything is inside. ``steps`` (2, s) are ones,
-    and the numbers of steps; ``widest`` is the longest step, px.
+    Outside the image its border pixels are repeated. None if almost all samples are outside.
+    ``steps`` (2, s) has a row of ones and the numbers of the steps; ``widest`` is the longest
+    step, px.
     """
     # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
     height, width = image.shape

@@ -15,9 +15,9 @@
 """
 Data association: selects the neighbor's track among all markers with its id.
 
-An id may appear twice: on the neighbor, and on a print on a wall. The primary track is used as
-the neighbor. Every other candidate has a track of its own, which replaces the primary track only
-if it can be the neighbor:
+An id may appear twice: on the neighbor, and on a print on a wall. The primary track is used as the
+neighbor. Every other print with the id has a separate track, a candidate, which replaces the
+primary track only if it can be the neighbor:
 
 ===============================  ================================================================
 the primary track is             the candidate takes its place
@@ -30,12 +30,12 @@ is, nor ever beside it           of the primary track ``leader_speed_max`` reach
 out of view                      after PATIENCE, if it has moved; never, if it stands still
 ===============================  ================================================================
 
-Poses by another detector have no id that is printed elsewhere, but single ones are outliers:
+Poses of another detector have no second print, but single poses are outliers:
 
 - A primary track with fewer than three measurements may have begun with an outlier: a candidate
-  with three since then takes its place.
-- A candidate that is not confirmed gets no measurement near the primary track: else the place of
-  an outlier ahead of a neighbor takes the measurements of that neighbor as it passes.
+  with three later measurements takes its place.
+- A candidate that is not confirmed gets no measurement near the primary track: otherwise an
+  outlier on a neighbor's path would take the measurements of this neighbor as it passes.
 
 Positions are in the smooth frame of ``OdometryBuffer``.
 """
@@ -91,7 +91,7 @@ class _Motion:
 
 @dataclass(eq=False)
 class Candidate:
-    """A track other than the primary one; candidates are numbered from 1 on."""
+    """A track that is not the primary track; candidates are numbered from 1 on."""
 
     number: int
     track: NeighborFilter
@@ -107,12 +107,12 @@ class Candidate:
 
     @property
     def confirmed(self) -> bool:
-        """Return whether it is more than a false detection."""
+        """Return whether the candidate is more than a false detection."""
         return self.measured >= N_CONFIRMED
 
     @property
     def seen(self) -> float:
-        """Return when it was measured last, s."""
+        """Return the time of the last measurement, s."""
         return -math.inf if self.track.newest is None else self.track.newest.stamp
 
     def distance(self, time: float, place: Array) -> float:
@@ -133,7 +133,7 @@ class Candidate:
 
 
 class Taken(NamedTuple):
-    """The outcome of a measurement: ``candidate`` is None if it is of the primary track."""
+    """The outcome of a measurement; ``candidate`` is None if it belongs to the primary track."""
 
     outcome: UpdateOutcome
     candidate: Candidate | None = None

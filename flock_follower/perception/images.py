@@ -19,11 +19,10 @@ Converts image messages to gray arrays of shape (height, width), uint8.
 without a copy (read-only if the payload is). ``decode_compressed`` takes that of
 ``CompressedImage``.
 
-``file_size`` checks that a JPEG or PNG file is complete and of a plausible size before it is
-decoded. Decoders trust their input: one wrong byte in the length of a PNG chunk makes OpenCV
-allocate gigabytes, and a small JPEG can claim to be 65535 pixels wide. OpenCV 4 returns a
-truncated JPEG with the previous content of its memory in the missing rows: often the image before,
-marker included.
+``file_size`` checks before the decoding that a JPEG or PNG file is complete and of a plausible
+size. Decoders do not check this: with one wrong byte in the length of a PNG chunk OpenCV allocates
+gigabytes, and a small JPEG can state a width of 65535 pixels. If a JPEG is truncated, OpenCV 4
+fills the missing rows with old memory, often the previous image with its marker.
 """
 
 from __future__ import annotations
@@ -160,7 +159,7 @@ class DecodedImage:
 
 def decode_image(message: Any) -> GrayImage:
     """
-    Return the pixels of an Image or CompressedImage message, (H, W) uint8, or those given.
+    Return the pixels of an Image or CompressedImage message, (H, W) uint8; of a DecodedImage too.
 
     :raises ValueError: if they cannot be decoded.
     """
@@ -214,7 +213,7 @@ def decode_compressed(data: Any) -> GrayImage:
     """
     Return a JPEG or PNG payload as (height, width) uint8.
 
-    :raises ValueError: if OpenCV cannot decode it, or should not, see ``file_size``.
+    :raises ValueError: if OpenCV cannot decode it, or ``file_size`` refuses it.
     """
     payload = np.frombuffer(data, dtype=np.uint8)
     file_size(payload.tobytes())
@@ -253,7 +252,7 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
 
 
 def gray_levels(image: GrayImage, pixels: Array) -> Any:
-    """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
+    """Return the brightness (n,) at pixels (n, 2); outside the image, that of its border."""
     at = pixels.astype(np.float32)[:, None]
     return cv2.remap(image, at, None, cv2.INTER_LINEAR,
                      borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)

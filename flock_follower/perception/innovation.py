@@ -15,11 +15,11 @@
 """
 Innovations of a filter: covariance, size, and errors that are correlated between images.
 
-A smear, a reflex or over-exposure lasts for several images, and so does the error of a pose that
-is measured in them: the mean of ten such images is hardly better than one. The filter considers
+A smear, a reflex or over-exposure lasts for several images, and causes similar errors of the
+measured poses: the mean of ten such poses is hardly better than one pose. The filter considers
 these errors without estimating them (Schmidt, "Application of state-space methods to navigation
-problems", 1966): it keeps the covariance of its state with them. They are of unit variance, of a
-measured point and of the attitude, and are forgotten with a time constant.
+problems", 1966): it stores the covariance between its state and the errors. The errors are those
+of a measured point and of the attitude, scaled to unit variance; they decay with a time constant.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FORGET_AFTER = 6.0  # time constants without such a measurement until the errors
 
 
 class AlikeErrors:
-    """``cross`` (15, 6): covariance of a filter's error state with the errors; None without."""
+    """``cross`` (15, 6): covariance of a filter's error state with the errors; None if zero."""
 
     def __init__(self) -> None:
         self.cross: Array | None = None
@@ -54,8 +54,8 @@ class AlikeErrors:
         """
         Take an update of the state.
 
-        :param remain: what it leaves of the error state, (15, 15); :param gain: (15, n).
-        :param root: :func:`root_of` the errors in what was measured, (n, 6); None without.
+        :param remain: the factor (15, 15) on the error state by the update; :param gain: (15, n).
+        :param root: :func:`root_of` the errors in the measurement, (n, 6); None without errors.
         """
         if self.cross is not None:
             self.cross = remain.dot(self.cross)
@@ -64,7 +64,7 @@ class AlikeErrors:
             self.cross = (0.0 if self.cross is None else self.cross) - gain.dot(root)
 
     def together(self, root: Array | None) -> Array | None:
-        """Return the covariance (15, n) of the state with what is measured; None if it is 0."""
+        """Return the covariance (15, n) of the state with the measurement; None if it is 0."""
         return None if root is None or self.cross is None else self.cross.dot(root.T)
 
 
@@ -87,7 +87,7 @@ def expected_innovation(prior: Array, jacobian: Array, noise: Array,
     """
     Return the covariances of an innovation with the state, (n, 15), and of itself, (n, n).
 
-    :param shared: that of the state with the noise, (15, n), if any.
+    :param shared: the covariance of the state with the noise, (15, n), if any.
     """
     across = jacobian.dot(prior)
     if shared is None:
@@ -100,8 +100,8 @@ def to_body(lever: Array) -> Array:
     """
     Return the matrix (6, 6) from the errors of a point and of the attitude to those of the body.
 
-    The point is off the body's origin by ``lever`` (3,) in odom: p = p_point - R l, so that
-    dp = dp_point + [R l]x dr.
+    ``lever`` (3,) is the vector from the body's origin to the point, in odom: p = p_point - R l,
+    so dp = dp_point + [R l]x dr.
     """
     matrix = np.eye(6)
     matrix[:3, 3:] = skew(lever)

@@ -15,20 +15,20 @@
 """
 Noise learned from innovations in flight: of the measurements, and of a neighbor's motion.
 
-If both are right, the innovations of a Kalman filter are white, of the expected covariance.
-Unmodeled motion correlates successive innovations. White measurement noise does not. So half the
-square of the difference of two successive innovations shows
-the noise of the measurements, and their mean over ``MEAN_TIME`` shows the motion (Mehra, "On the
-identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control, 1970).
+If the assumed noises are right, the innovations of a Kalman filter are white and have the expected
+covariance. Unmodeled motion correlates successive innovations; white measurement noise does not.
+So half the squared difference of two successive innovations measures the noise of the
+measurements, and their mean over ``MEAN_TIME`` measures the motion (Mehra, "On the identification
+of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control, 1970).
 
 ``LearnedNoise``: across the line of sight, the noise is the error of the ego attitude, which moves
 a neighbor sideways: errors of the odometry, of its interpolation and of the camera's stamps.
 Along the line of sight, the noise is anything that changes the marker's apparent size: a rolling
-shutter, a bent print, motion blur. The covariances of measured poses are widened, because the
-errors of neighboring edges may be alike: the innovations show how much of that is needed.
+shutter, a bent print, motion blur. The covariances of measured poses are increased, because the
+errors of adjacent edges may be correlated; the innovations show which increase is needed.
 
-``LearnedMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
-follow the motion of a neighbor and the errors of the ego velocity.
+``LearnedMotion``: factors on the process noise of ``FilterParams``, along each axis of odom. They
+adapt to the motion of a neighbor, and to the errors of the ego velocity.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class LearnedNoise:
     """
     The noise of the ego attitude, rad, about each axis, and of the distance, as a share of it.
 
-    ``shares``: of the variances of a measured position and attitude, the shares that are noise.
+    ``shares`` are the factors of noise on the variances of a measured position and attitude.
 
-    :param initial: initial value for the attitude, rad; the distance starts at 0.
+    :param initial: initial noise of the attitude, rad; the noise of the distance starts at 0.
     """
 
     def __init__(self, initial: float) -> None:
@@ -106,7 +106,7 @@ class LearnedNoise:
 
     def take(self, change: Array, expected: Array, sight: Array) -> None:
         """
-        Take the change of an innovation: the fields of ``neighbor_filter.Change``.
+        Take the change of an innovation, as in ``neighbor_filter.Change``.
 
         :param sight: from the ego vehicle to the neighbor (3,), m.
         """
@@ -177,7 +177,7 @@ class LearnedMotion:
         """
         Take an innovation of the position (3,), m, and its expected covariance (3, 3).
 
-        :param dt: time since the innovation before, s.
+        :param dt: time since the previous innovation, s.
         """
         if dt > LEARNING_GAP:
             self._share, self._means = 0.0, [0.0] * 3

@@ -13,14 +13,13 @@
 # limitations under the License.
 
 """
-One image in perception: its expected content, and the content that was found.
+One image in perception: the expected neighbors and the measured neighbors.
 
-``CameraMotion`` is the camera's pose and motion at the time of an image, or of one of its rows. A
-rolling shutter exposes row r of an image of height h r / h * readout_time after the first row. A
-neighbor counts as seen when the row of its markers' middle was exposed. The rows above and below
-see it earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners
-to where they were with the middle row, by the relative motion, which comes mostly from the ego
-rates.
+``CameraMotion`` is the camera's pose and motion at the time of an image, or of one row. A rolling
+shutter exposes row r of an image of height h at the time r / h * readout_time after the first row.
+The time of a measurement is the exposure of the row in the middle of the markers. The rows above
+and below are exposed earlier and later, so the marker looks sheared or stretched. ``straightened``
+removes this effect by the relative motion, which comes mostly from the ego angular velocity.
 """
 
 from __future__ import annotations
@@ -93,10 +92,10 @@ class CameraMotion(NamedTuple):
     def passing(self, T_camera_body: Transform, reference: Array,
                 estimate: Estimate | None) -> tuple[Array, Array]:
         """
-        Return how a neighbor moves past the camera: velocity of a point, m/s, and rates, rad/s.
+        Return a neighbor's motion relative to the camera: velocity of a point, m/s; rates, rad/s.
 
-        :param reference: the point (3,) on the body; :param estimate: its state, if known: else
-            it is taken to fly along.
+        :param reference: the point (3,) on the body; :param estimate: the neighbor's state; if
+            None, the neighbor is assumed to fly with the ego velocity.
         """
         to_camera = self.T_smooth_camera.rotation.T
         own_rates = to_camera.dot(self.turning)
@@ -131,8 +130,8 @@ class MeasuredPose(NamedTuple):
     A neighbor's body in the camera's optical frame, as measured in one image.
 
     ``covariance`` (6, 6): position of the body, m, and rotation vector, rad, along the camera's
-    axes. The errors of the ego attitude, with which the filter takes the measurement, are not in
-    it: they do not move a body in the camera's frame.
+    axes. It does not contain the errors of the ego attitude, which the filter adds, because they
+    do not move a body in the camera's frame.
     """
 
     T_camera_body: Transform
@@ -162,7 +161,7 @@ class MeasuredPose(NamedTuple):
 
 def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
     """
-    Return the delay from the exposure of the first row to that of the row that shows the point, s.
+    Return the delay between the exposures of the first row and of the row with the point, s.
 
     :param readout_time: from the first row to the last, s.
     :param seen: the point (3,), m, in the optical frame.
@@ -177,11 +176,11 @@ def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeigh
                  T_camera_body: Transform, reference: Array, velocity: Array,
                  rates: Array) -> Transform:
     """
-    Return the pose of a neighbor at the time of one row, from the pose fitted to all of them.
+    Return the pose of a neighbor at the time of one row, from the pose fitted to all rows.
 
-    :param reference: the point (3,) on its body whose row that is, m.
-    :param velocity: of that point seen from the camera, m/s, and :param rates: rad/s, at which the
-        body turns there: (3,) along the camera's axes.
+    :param reference: the point (3,) on the body, m, that this row shows.
+    :param velocity: of this point relative to the camera, m/s, and :param rates: of the body,
+        rad/s, relative to the camera: (3,) along the camera's axes.
     """
     points = np.concatenate([
         marker.T_body_marker.apply(marker_corners(marker.side_length))
@@ -208,14 +207,13 @@ class Sighting:
     """
     The result of one image.
 
-    ``estimates`` and ``measurements`` by neighbor's name, of the neighbors measured in this
-    image; ``poses`` return the measured ones, except those whose attitude was not plausible;
-    ``stage`` is the costliest stage of detection that was used, 'none' if the image could
-    not be used or no neighbor was to be detected in it. ``rejections`` are (reason, detail), one
-    for each thing dropped; ``other_ids`` are the ids of markers of no neighbor. ``duplicates``,
-    by names made of the neighbors', are the states of candidates measured in this image that
-    carry a neighbor's marker and are not its primary track. ``misprints``: why the marker of a
-    neighbor, by its name, was found and refused.
+    ``estimates`` and ``measurements`` have the neighbors measured in this image, by name.
+    ``poses`` return the measured poses with a plausible attitude. ``stage`` is the costliest stage
+    of detection that was used; 'none' if the image could not be used, or no neighbor was searched.
+    ``rejections`` has a pair (reason, detail) for each rejected measurement; ``other_ids`` are the
+    ids of markers of no neighbor. ``duplicates`` are the states of measured candidates that are
+    not the primary track, by names made of the neighbors' names. ``misprints``: by neighbor's
+    name, why a detected marker was refused.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -238,9 +236,10 @@ class Look:
     """
     An image of a camera: the neighbors expected, those to search for, and those measured.
 
-    ``near`` are the neighbors that may be in the image where they are expected, ``anywhere``
-    those to search for if they are not found there. ``expected`` and ``measured`` are by
-    neighbor; ``others`` are measurements of candidates, not of the primary track.
+    ``near`` are the neighbors that may be at their expected place in the image, ``anywhere`` the
+    neighbors to search in the whole image if they are not found there. ``expected`` and
+    ``measured`` are by neighbor; ``others`` are measurements of candidates, not of the primary
+    track.
     """
 
     stamp: float
@@ -292,13 +291,13 @@ class Look:
         return math.dist(measurement.T_camera_body.translation, place)
 
     def known(self, measurement: Measurement, side: float) -> bool:
-        """Return whether a body was measured before at the same place, to within ``side``, m."""
+        """Return whether a body was already measured at the same place, to within ``side``, m."""
         place = measurement.T_camera_body.translation
         return any(math.dist(each.T_camera_body.translation, place) < side
                    for each in self._of(measurement.name))
 
     def shown(self, corners: Array, name: str, marker: Marker) -> bool:
-        """Return whether corners (4, 2), px, are of a marker that was measured before."""
+        """Return whether corners (4, 2), px, are those of a marker that was already measured."""
         size = 0.5 * float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)))
         middles = [self.model.project((each.T_camera_body @ marker.T_body_marker)
                                       .translation[None])[0] for each in self._of(name)]

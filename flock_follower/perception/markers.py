@@ -45,7 +45,7 @@ class Detections(NamedTuple):
     The markers in an image.
 
     ``ids`` (N,); ``corners`` (N, 4, 2), px, in the marker's own order top-left, top-right,
-    bottom-right, bottom-left, where the outline's edges would cross if it were sharp.
+    bottom-right, bottom-left. A corner is the crossing of the outline's edges in a sharp image.
     """
 
     ids: NDArray[np.int64]
@@ -56,7 +56,7 @@ NO_DETECTIONS = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 
 
 def dictionary_names() -> list[str]:
-    """Return the names of the predefined dictionaries of the OpenCV at hand."""
+    """Return the names of the predefined dictionaries of the installed OpenCV."""
     return sorted(name for name in dir(_cv_aruco) if name.startswith('DICT_'))
 
 
@@ -87,7 +87,7 @@ def marker_cells(name: str) -> int:
 
 def correctable_cells(name: str) -> int:
     """
-    Return how many cells of a marker may be misread while it is still nearest to its own code.
+    Return how many cells may be misread so that a marker is still nearest to its own code.
 
     :raises ValueError: for an unknown dictionary.
     """
@@ -152,7 +152,7 @@ def detect(image: GrayImage, dictionary: str, border: int = 1) -> Detections:
 
 
 def outwards(corners: Array, by: float) -> Array:
-    """Return corners (N, 4, 2), px, of quadrilaterals whose sides are ``by`` px further out."""
+    """Return corners (N, 4, 2), px, of quadrilaterals with sides ``by`` px farther outside."""
     legs = [corners - np.roll(corners, k, axis=1) for k in (1, -1)]
     legs = [leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-9) for leg in legs]
     sine = np.abs(legs[0][..., 0] * legs[1][..., 1] - legs[0][..., 1] * legs[1][..., 0])
@@ -183,7 +183,7 @@ def marker_corners(side_length: float) -> Array:
 
 def load(path: str | Path) -> NeighborConfig:
     """
-    Read a neighbors file; its dictionary is one of the OpenCV at hand.
+    Read a neighbors file; its dictionary must be in the installed OpenCV.
 
     :raises ValueError, OSError: see :func:`flock_follower.neighbors_file.load`.
     """

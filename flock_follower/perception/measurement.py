@@ -15,9 +15,9 @@
 """
 The measurement of one neighbor in one image, and the choice between its possible attitudes.
 
-A square looks almost the same mirrored about the line of sight, and its edges do not always
-decide. ``choose`` adds two priors: the expected attitude, and that a neighbor flies about
-upright.
+A square that is mirrored about the line of sight looks almost the same, and the edges do not
+always show which attitude is right. ``choose`` adds two priors: the expected attitude, and an
+approximately upright neighbor.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Hypothesis(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The most likely pose and its lead in chi^2; the other pose, if any, and its probability."""
+    """The most likely pose, and how much better its chi^2 is; the other pose, its probability."""
 
     chosen: Hypothesis
     margin: float
@@ -106,17 +106,17 @@ class Measurement(NamedTuple):
     """
     One neighbor in one image.
 
-    ``T_camera_body`` is its body's pose in the optical frame, m. ``covariance`` (6, 6) is of the
-    position of ``reference`` (3,), a point on the body, m, then of the rotation vector r in
-    R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges are
-    from their projections, px; of a smeared marker the difference of its image from the
-    rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
-    ``spacing``, px, of the brightness profiles, None without profiles: of a smeared print.
-    ``margin`` is by how much chi^2 favors this attitude over the mirrored one; 0 if both are
-    equal, infinite if several markers decide it, None if it was not checked. ``doubt`` is the
-    probability of the mirrored attitude when it was last checked. ``alike`` is the share of the
-    covariance that is of errors alike from image to image. ``smear`` and ``lens`` are those of
-    a smeared print, as in ``SmearFit``.
+    ``T_camera_body`` is the body's pose in the optical frame, m. ``covariance`` (6, 6) is the
+    covariance of the position of ``reference`` (3,), a point on the body, m, then of the rotation
+    vector r in R_true = exp(r) R, both along the camera's axes. ``rms`` is the distance of the
+    edges from their projections, px; for a smeared marker, the difference between its image and
+    the rendered image, as a share of the contrast. ``stage`` is how the neighbor was found:
+    'track', 'roi' or 'full'. ``spacing``, px, is that of the brightness profiles; None for a
+    smeared print. ``margin`` is by how much chi^2 favors this attitude over the mirrored one: 0 if
+    both are equal, infinite if several markers decide, None if not checked. ``doubt`` is the
+    probability of the mirrored attitude at the last check. ``alike`` is the share of the
+    covariance by errors that are correlated between images. ``smear`` and ``lens`` are those of a
+    smeared print, as in ``SmearFit``.
     """
 
     name: str
@@ -134,7 +134,7 @@ class Measurement(NamedTuple):
 
 
 def mix_poses(measurement: Measurement, best: Choice) -> Measurement:
-    """Return a measurement with mean and covariance of both poses, and the margin of the best."""
+    """Return a measurement with mean and covariance of both poses, and the better one's margin."""
     measurement = measurement._replace(margin=best.margin, doubt=min(best.share, 1.0 - best.share))
     if best.other is None or not best.share > 1e-6:
         return measurement

@@ -15,14 +15,13 @@
 """
 Estimates a neighbor's position, velocity, attitude and acceleration: a Kalman filter in odom.
 
-The state is in odom, not relative to the ego vehicle: ego maneuvers do not appear as maneuvers of
-the neighbor, and slow drift of the odometry displaces both equally. ``neighbor_motion`` has the
-motion
-model and the state.
+The state is in odom, not relative to the ego vehicle: so ego maneuvers do not appear as maneuvers
+of the neighbor, and a slow drift of the odometry displaces both equally. ``neighbor_motion`` has
+the motion model and the state.
 
-A measurement is the position of a point on the body, where its markers are, and the attitude.
-Together they give the position of the body; an uncertain attitude widens it by the lever of the
-point.
+A measurement is the position of a point on the body, where its markers are, and the attitude. Both
+give the position of the body; the farther the point is from the body's origin, the more an
+uncertain attitude adds to the uncertainty of this position.
 """
 
 from __future__ import annotations
@@ -119,10 +118,11 @@ class NeighborFilter:
     """
     The filter of one neighbor.
 
-    A measurement outside the gate is used with less weight. The first gets the weight that puts it
-    on the gate: it may be wrong. If the next one is off to the same side, the track is wrong, and
-    the covariance of the prediction grows. A measurement beyond ``WILD_FACTOR``, or
-    outside the gate and out of reach, is refused: ``hypotheses`` tracks it separately.
+    A measurement outside the gate is used with less weight. The first one may be wrong, and gets
+    the weight of a measurement on the gate. If the next one differs in the same direction, the
+    track is wrong, and the covariance of the prediction is increased. A measurement beyond
+    ``WILD_FACTOR``, or one outside the gate that the neighbor cannot reach, is refused:
+    ``hypotheses`` tracks it separately.
     """
 
     def __init__(self, params: FilterParams | None = None) -> None:
@@ -153,7 +153,7 @@ class NeighborFilter:
         """
         Return the state predicted for a stamp, s; None without a track, or if it is too old.
 
-        The filter itself is not altered. A stamp before the newest measurement gives None.
+        The filter is not changed. For a stamp before the newest measurement the result is None.
         """
         now = self.newest
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
@@ -165,7 +165,7 @@ class NeighborFilter:
         return self._predicted
 
     def place(self, stamp: float) -> Transform | None:
-        """Return the pose that :meth:`predict` expects, approximately, at far less cost."""
+        """Return approximately the pose of :meth:`predict`, at far less cost."""
         now = self.newest
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None
@@ -189,8 +189,8 @@ class NeighborFilter:
         """
         Add an error state (15,) that was found elsewhere, and widen the covariance accordingly.
 
-        The state is then that of ``later``, s, after its stamp. The motion that was learned with
-        the error is forgotten.
+        The state then holds for a time ``later``, s, after its stamp. The motion that was learned
+        with the error is forgotten.
         """
         self._motion = LearnedMotion()
         if self.newest is not None:
@@ -220,8 +220,8 @@ class NeighborFilter:
         The covariance is of the position of ``reference`` (3,), a point on the body, m, then of
         the rotation vector.
 
-        :param alike: the part of it, (6, 6), that is of errors alike from image to image, if any.
-        :param reach: how far from the newest estimate the body can be by now, m.
+        :param alike: the part of the covariance, (6, 6), by errors correlated between images.
+        :param reach: the largest possible distance of the body from its newest estimate, m.
         """
         self.change = None
         now = self.newest
@@ -323,11 +323,11 @@ class NeighborFilter:
         """
         Update with the measured distance, m, to ``reference`` (3,), a point on the body, m.
 
-        The update corrects the state only along the line between the two: an uncertain direction
-        would otherwise change the state across it, too. ``range_gate`` handles outliers. No track
-        begins with a distance.
+        The update corrects the state only along the line of sight: with an uncertain direction it
+        would otherwise also change the state across this line. ``range_gate`` handles outliers. No
+        track begins with a distance.
 
-        :param own_position: where it was measured (3,), m, in odom.
+        :param own_position: place of the measurement (3,), m, in odom.
         :param variance: of the distance, m^2.
         """
         now, expected = self.newest, self.predict(stamp)

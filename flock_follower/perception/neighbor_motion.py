@@ -20,9 +20,9 @@ The state of a neighbor and its motion model.
 with R_true = exp(dr) R, a rotation vector along odom's axes.
 
 ``transition``: the acceleration follows Singer's model ("Estimating optimal tracking filter
-performance for manned maneuvering targets", IEEE Trans. AES, 1970): of standard deviation s,
-forgotten with a time constant T, driven by white jerk of spectral density 2 s^2 / T. White angular
-acceleration drives the angular velocity.
+performance for manned maneuvering targets", IEEE Trans. AES, 1970): it has the standard deviation
+s, decays with a time constant T, and is driven by white jerk of spectral density 2 s^2 / T. White
+angular acceleration drives the angular velocity.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ class Estimate(NamedTuple):
     ``position`` (3,), m; ``velocity`` (3,), m/s; ``rotation`` (3, 3), body to odom;
     ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
     ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
-    odom's axes), angular velocity and acceleration. It is of the state relative to the ego one:
-    both share the errors of the ego odometry, but for the white noise of the ego attitude and
-    velocity, which published covariances include.
+    odom's axes), angular velocity and acceleration. The covariance is that of the state relative
+    to the ego state, because both have the same errors of the odometry. Published covariances add
+    the white noise of the ego attitude and velocity.
     """
 
     stamp: float
@@ -82,7 +82,7 @@ class Estimate(NamedTuple):
             transition.dot(self.covariance).dot(transition.T) + noise)
 
     def corrected(self, error: Array, covariance: Array) -> Estimate:
-        """Return the state with an error state (15,) added, and another covariance (15, 15)."""
+        """Return the state plus an error state (15,), with a new covariance (15, 15)."""
         return Estimate(
             self.stamp, self.position + error[POSITION], self.velocity + error[VELOCITY],
             rotation_vector_to_matrix(error[ATTITUDE]).dot(self.rotation),
@@ -117,7 +117,7 @@ class Estimate(NamedTuple):
 
     @property
     def child_acceleration_covariance(self) -> Array:
-        """Return the covariance (3, 3) of ``child_acceleration``, but for the attitude's share."""
+        """Return the covariance (3, 3) of ``child_acceleration``, without the attitude's share."""
         own = self.covariance[ACCELERATION, ACCELERATION]
         covariance: Array = self.rotation.T @ own @ self.rotation
         return covariance
@@ -150,15 +150,16 @@ class FilterParams(Checked):
 
     ``acceleration`` is the standard deviation of a neighbor's acceleration, m/s^2 per axis, and
     ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
-    spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
-    ``odometry_noise`` is the random walk of the error of the ego velocity, m/s^2/sqrt(Hz).
-    ``initial_speed``, m/s, is the deviation before any motion has been seen.
-    ``attitude_noise``, rad, is the noise of the ego attitude from one image to the next; it moves
-    a distant neighbor sideways.
-    ``max_rejections`` measurements in a row outside the gate restart the filter, or in 0.2 s at
-    least three whose attitude is; as does a gap
-    above ``max_gap`` s or a stamp more than ``MAX_JUMP`` s back. A restart that needs more than
-    ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
+    spectral density of its angular acceleration, rad/s^2/sqrt(Hz). ``odometry_noise`` is the
+    random walk of the error of the ego velocity, m/s^2/sqrt(Hz). ``initial_speed``, m/s, is the
+    standard deviation of the velocity at the beginning of a track. ``attitude_noise``, rad, is
+    the noise of the ego attitude from one image to the next, which moves a distant neighbor
+    sideways.
+
+    The filter restarts after ``max_rejections`` successive measurements outside the gate; after
+    0.2 s with at least three measurements whose attitude is outside; after a gap above ``max_gap``
+    s; and for a stamp more than ``MAX_JUMP`` s back. A restart at a place that a neighbor cannot
+    reach with ``leader_speed_max``, m/s, is refused, see ``hypotheses``.
     """
 
     acceleration: float = parameter(
@@ -183,9 +184,9 @@ def motion(dt: float, params: FilterParams) -> tuple[Array, Array]:
     """
     Return the transition of (p, v, a) along an axis in dt, s, (3, 3), and its noise, (3, 3).
 
-    Singer's transition is exact. Its noise is that of white jerk of the same density, which it
-    tends to for a time constant much longer than dt.
-    A negative dt predicts backwards, and adds the same noise.
+    Singer's transition is exact. The noise is that of white jerk with the same density, a good
+    approximation for a time constant much longer than dt. A negative dt predicts backwards, and
+    adds the same noise.
     """
     T, x = params.acceleration_time, dt / params.acceleration_time
     decay = math.exp(-x)
@@ -227,9 +228,9 @@ def turned_along(covariance: Array, before: Array, now: Array) -> Array:
     """
     Return a covariance (15, 15) rotated from one line to another.
 
-    If only its distance is known, a neighbor may be anywhere on a sphere. If the line to its
-    likeliest place turns, from ``before`` to ``now``, unit vectors (3,), the covariance turns with
-    that line. ``before`` of zeros turns nothing.
+    If only the distance of a neighbor is known, the neighbor may be anywhere on a sphere. If the
+    line to its most likely place rotates from ``before`` to ``now``, unit vectors (3,), the
+    covariance rotates with this line. With ``before`` zero nothing is rotated.
     """
     cross = skew(np.cross(before, now))
     turn = _EYE_3 + cross + cross @ cross / max(1.0 + float(before.dot(now)), 0.1)
@@ -243,9 +244,9 @@ def bounded_across(covariance: Array, along: Array, distance: float, speed: floa
     """
     Return a covariance (15, 15) with bounded deviations across a line ``along`` (3,).
 
-    Across the line along which the distance, m, was measured, the deviation of the position is at
-    most the distance, and that of the velocity at most ``speed``, m/s. Larger ones would make the
-    distance uncertain after a small turn of the line.
+    Across the line along which the distance, m, was measured, the standard deviation of the
+    position is at most the distance, and that of the velocity at most ``speed``, m/s. Larger
+    deviations would make the distance uncertain after a small rotation of the line.
     """
     scale, line = np.eye(STATE_SIZE), np.outer(along, along)
     for part, most in ((POSITION, distance), (VELOCITY, speed)):

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The longest time for which a message waits for another one, from the waits observed."""
+"""The longest time for which a message waits for another message, from the observed waits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ObservedWait:
     """
     Waits for ``factor`` times the longest observed wait and LATE_MARGIN, at most ``max_wait``, s.
 
-    :param needed: number of observed waits before the limit is shorter than ``max_wait``.
+    :param needed: number of waits to observe before the limit can be below ``max_wait``.
     """
 
     def __init__(self, max_wait: float, factor: float, needed: int) -> None:
@@ -42,9 +42,9 @@ class ObservedWait:
         return min(self._factor * max(self._waits) + LATE_MARGIN, self._max_wait)
 
     def observe(self, waited: float) -> None:
-        """Record the length of a wait that ended with the awaited message, s."""
+        """Record the length, s, of a wait that ended with the expected message."""
         self._waits.append(waited)
 
     def forget(self) -> None:
-        """Forget the observed waits: the awaited message may be later from now on."""
+        """Forget the observed waits, because the expected message may now come later."""
         self._waits.clear()

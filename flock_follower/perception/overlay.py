@@ -46,10 +46,10 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
     """
     Return a copy of an image (H, W) uint8 as BGR (H, W, 3), with its sighting drawn over it.
 
-    Of each measured neighbor: the outlines of its markers that face the camera, in the color of
-    the stage of detection, the axes of its body, x red, y green, z blue, and the ellipse of two
-    standard deviations of the place that was measured, in white. The text on top lists
-    distances, neighbors that are not seen, and rejections.
+    The drawing of a measured neighbor has the outlines of its markers that face the camera, in the
+    color of the stage of detection; the axes of its body, x red, y green, z blue; and in white the
+    ellipse of two standard deviations of the measured place. The text at the top lists distances,
+    missing neighbors, and rejections.
     """
     canvas: ColorImage = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
     lines = []

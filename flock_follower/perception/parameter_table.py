@@ -85,7 +85,7 @@ def tracker(values: Mapping[str, Any]) -> Tracker:
     """
     Return the tracker of the parameters of relative_pose.
 
-    :raises ValueError: if they, or the neighbors' file, are wrong.
+    :raises ValueError: if the parameters, or the neighbors' file, are wrong.
     :raises OSError: if the file cannot be read.
     """
     path = values['neighbors_file'] or resource('config/neighbors.yaml')

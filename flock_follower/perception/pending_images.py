@@ -15,8 +15,8 @@
 """
 Perception from messages to messages: calibrations, odometry, and the queue of images.
 
-An image is processed as soon as odometry has reached its stamp. It waits a little longer than
-recent images had to, and never longer than ``max_wait``.
+An image is processed as soon as odometry has reached its stamp. It waits at most a little longer
+than recent images, and never longer than ``max_wait``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class PendingImage(NamedTuple):
     """
     An image message, its time of arrival (s, any clock), its stamp in ns and s, its camera.
 
-    ``model``, from :meth:`Perceiver.process`: the calibration; None as long as no usable one came.
+    ``model`` is the calibration, set by :meth:`Perceiver.process`; None before a usable
+    calibration.
     """
 
     received: float
@@ -70,8 +71,8 @@ class Processed(NamedTuple):
     """
     The result of one image.
 
-    ``pixels`` is None if the image was not decoded: it cannot be used, or no neighbor is to be
-    looked for in it. ``decoding`` and ``perception`` are the times spent, s.
+    ``pixels`` is None if the image was not decoded, because it cannot be used, or no neighbor is
+    searched in it. ``decoding`` and ``perception`` are the times spent, s.
     """
 
     image: PendingImage
@@ -100,8 +101,8 @@ class Perceiver:
     """
     Feeds a tracker from messages.
 
-    ``now`` is seconds on any clock that runs evenly, the same for all calls. Cameras are called
-    by their names, as in the tracker; the only one by ''.
+    ``now`` is in seconds on a clock without jumps, the same clock for all calls. Cameras have
+    their names, as in the tracker; a single camera has the name ''.
 
     :param max_wait: the longest time for which an image waits for odometry of its stamp, s.
     """
@@ -129,7 +130,7 @@ class Perceiver:
         """
         Take a CameraInfo; return whether it holds another calibration than the one before.
 
-        :raises ValueError: if it is unusable; no image is processed until a usable one comes.
+        :raises ValueError: if it is unusable; no image is processed until a usable message comes.
         """
         roi, rectified = message.roi, self.tracker.cameras[camera].rectified
         # Of an image that is not rectified P does not count, and may be NaN, unlike itself.
@@ -158,7 +159,7 @@ class Perceiver:
         """
         Take the ego state; return whether time jumped back and everything restarted.
 
-        Images that were waiting are then forgotten.
+        In this case the waiting images are forgotten.
         """
         if not self._choice.takes(state):
             return False
@@ -176,7 +177,7 @@ class Perceiver:
     def take_image(self, message: Any, stamp: int, now: float,
                    camera: str = '') -> PendingImage | None:
         """
-        Take an Image or CompressedImage; return the oldest waiting one if it was dropped.
+        Take an Image or CompressedImage; return the oldest waiting image if it was dropped.
 
         :param stamp: its stamp, ns.
         """
@@ -204,7 +205,7 @@ class Perceiver:
         Process the next image that need not wait, and return its result; None if all wait.
 
         :param clock: measures the time spent, s.
-        :param shown: returns of a camera's name whether its images are decoded in any case.
+        :param shown: returns, for a camera's name, whether its images are decoded in any case.
         """
         ready = next((each for each in self._pending if self._is_ready(each, now)), None)
         if ready is None:
@@ -271,7 +272,7 @@ class Perceiver:
         """
         Yield the topic and PoseWithCovarianceStamped of each pose measured in an image.
 
-        :param wanted: returns of a topic whether a message is needed.
+        :param wanted: returns, for a topic, whether a message is needed.
         """
         image = seen.image
         header = getattr(image.message, 'header', None)  # pixels have none

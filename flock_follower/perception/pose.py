@@ -15,9 +15,9 @@
 """
 From a neighbor's markers in an image to its pose and covariance.
 
-Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
-and the more probable is kept. If motion or a lens out of focus leave no edges, the whole print is
-fitted as it is smeared.
+Two attitudes explain a single marker almost equally well. Both are fitted to the edges, and the
+more probable attitude is used. If the image has no edges because of motion or a lens out of focus,
+the smeared print is fitted as a whole.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     """
     Return the measurement of a neighbor near its expected place, or None if no marker fits.
 
-    :param last: its last measurement, if any. If its print was smeared, the smear is fitted first,
+    :param last: the last measurement, if any. If its print was smeared, the smear is fitted first,
         and edges only if the print is sharp again.
     :param check_mirrored: whether to compare with the mirrored attitude.
     """
@@ -205,7 +205,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
 
     :param index: of the marker among the neighbor's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
-    :param smeared: whether its whole print is fitted if its edges are smeared.
+    :param smeared: whether to fit the print as a whole if its edges are smeared.
     """
     alone, starts = _starts_of(camera, sought, index, corners)
     near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
@@ -238,8 +238,8 @@ def locate_by_edges(image: GrayImage, camera: CameraModel, sought: Target, index
     """
     Return a neighbor by the edges of one detected marker, or None if no pose fits them.
 
-    The costs are half of those of :func:`locate`: one attitude is fitted to the image, and the
-    mirrored one to the edges that this fit found.
+    This costs half as much as :func:`locate`: one attitude is fitted to the image, and the
+    mirrored attitude to the edges that this fit found.
 
     :param index, corners: as in :func:`locate`. :param up: as in ``PosePrior``.
     """

@@ -15,10 +15,10 @@
 """
 Poses of neighbors that other detectors measure: their checks, and their way into the tracker.
 
-A pose waits until odometry reaches its stamp, as an image does. It then enters the tracker at the
-place where the measurement of a marker does. The stamps of the images that the other detector
-processes (``frames_topic``) are passed on after the poses of these images: when a pose of that
-image or a later one was used, or when a pose of it would be late.
+A pose waits until odometry reaches its stamp, as an image does. Then the tracker takes it like the
+measurement of a marker. The stamps of the images that the other detector processes
+(``frames_topic``) are passed on after the poses of these images: when a pose of the same or a
+later image was used, or when a pose of this image would be late.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class _Frame(NamedTuple):
 
 class PoseSources:
     """
-    Takes poses and the stamps of frames; ``now`` is seconds on any clock that runs evenly.
+    Takes poses and the stamps of frames; ``now`` is in seconds on a clock without jumps.
 
     ``frames`` has the optical frames of the ego cameras on the body, ``static`` those of
     ``/tf_static``.
@@ -119,7 +119,7 @@ class PoseSources:
         self.restart()
 
     def place_cameras(self, placed: Iterable[tuple[str, Transform]]) -> None:
-        """Take frame and pose on the body of each camera; a frame of two cameras is of neither."""
+        """Take frame and pose of each camera on the body; a frame of two cameras is not used."""
         placed = [(stripped, pose) for name, pose in placed if (stripped := name.lstrip('/'))]
         names = [name for name, _ in placed]
         self.frames = {name: pose for name, pose in placed if names.count(name) == 1}
@@ -140,7 +140,7 @@ class PoseSources:
     def take(self, name: str, state: PoseState, stamp: float, now: float,
              odom_frame: str) -> Rejection | None:
         """
-        Take a neighbor's pose, to be used by :meth:`due`; return why it is dropped, or None.
+        Take a neighbor's pose for :meth:`due`; return why it is dropped, or None.
 
         :param stamp: its stamp, s, by the clock of the odometry.
         :param odom_frame: the frame of the odometry; '' if it is unknown.
@@ -179,7 +179,7 @@ class PoseSources:
         return None
 
     def take_frame(self, stamp_ns: int, stamp: float, now: float) -> None:
-        """Take the stamp of an image that the other detector gets, in ns and s."""
+        """Take the stamp of an image that the other detector processes, in ns and s."""
         if self._frames and stamp < self._frames[-1].stamp:
             self._frames.clear()
         self._frames.append(_Frame(stamp, stamp_ns, now))
@@ -224,7 +224,7 @@ class PoseSources:
         return self._tracker.process_pose(each.stamp, each.name, pose, covariance, mounting)
 
     def mounting(self, frame: str) -> Transform | None:
-        """Return the pose of a frame on the own body; None if it is not known to be there."""
+        """Return the pose of a frame on the ego body; None if no such frame is known."""
         if frame == BASE:
             return Transform()
         known = self.frames.get(frame)

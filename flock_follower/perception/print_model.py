@@ -15,13 +15,13 @@
 """
 The print of a marker: its edges for the fit, its cells, and whether an image shows its code.
 
-Edge points lie on the borders between black and white cells, away from the ends of every straight
-run, where blur rounds the corner.
+Edge points are on the borders between black and white cells, but not near the ends of a straight
+border, where blur rounds the corner.
 
-``shows_code`` makes the final decision on a tracked marker. Light on a marker may be uneven: the
-edge of a shadow may leave white in the shade darker than black in the sun. Within a window of a
-few cells on one side of that edge, black and white stay apart. Each cell is therefore compared
-with its surrounding cells, in the window in which they agree best with the code.
+``shows_code`` makes the final decision on a tracked marker. Light on a marker may be uneven: white
+in a shadow may be darker than black in the sun. In a window of a few cells on one side of the
+shadow's edge, black and white can still be distinguished. So each cell is compared with the cells
+around it, in the window that agrees best with the code.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class Windows(NamedTuple):
     """
     Windows on the c cells of a marker.
 
-    ``cells`` (w, k) are the indices of the cells in each window, repeated where it has fewer
-    than k; ``white`` and ``black`` (w, k) are 1 if a cell should have that color, else 0, and
-    0 for those repeated. ``places`` (c, p) are where in (w, k), flattened, each cell is, repeated
-    where it is in fewer than p.
+    ``cells`` (w, k) are the indices of the cells in each window, with repetitions if it has fewer
+    than k cells. ``white`` and ``black`` (w, k) are 1 if a cell should have this color, else 0; 0
+    for repetitions. ``places`` (c, p) are the positions of each cell in the flattened (w, k), with
+    repetitions if there are fewer than p.
     """
 
     cells: NDArray[np.intp]
@@ -92,9 +92,9 @@ def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
 
 def read(brightness: Array, seen: Windows) -> Array:
     """
-    Return the colors (n, c) of cells from their brightness (n, c), gray levels, n times alike.
+    Return the colors (n, c) of cells from their brightness (n, c), gray levels, of n readings.
 
-    -1: like the black cells around it, 1: like the white ones, 0: no cells to compare with.
+    -1: as the black cells around, 1: as the white cells around, 0: no cells for a comparison.
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []
@@ -132,13 +132,13 @@ class CellCode:
     """
     The code of a marker of a dictionary: the colors of its cells.
 
-    ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
-    then of the white ones around, on the neighbor's body, m; ``grid`` (c, 2) their columns and
-    rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread. ``others``
-    (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells that are
-    compared with one another under uneven light. ``beside`` (b, c): 1 for the cells next to an
-    inner one. ``by_cell`` takes pixels (c, 2) to how far, px,
-    it is from cell to cell along rows and columns, (2, c).
+    ``centers`` (c, 3) are the middles of the ``bits.size`` inner cells, then of ``border`` black
+    cells, then of the white cells around, on the neighbor's body, m; ``grid`` (c, 2) their columns
+    and rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread.
+    ``others`` (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells
+    that are compared with each other under uneven light. ``beside`` (b, c): 1 for the cells next
+    to an inner cell. ``by_cell`` converts pixels (c, 2) to the distances between cells along rows
+    and columns, px, (2, c).
     """
 
     def __init__(self, marker: Marker, dictionary: str) -> None:
@@ -173,12 +173,13 @@ cell_code = lru_cache(maxsize=64)(CellCode)
 
 def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = False) -> bool:
     """
-    Return whether an image shows a marker's code, its cells' middles being at ``pixels`` (c, 2).
+    Return whether an image shows a marker's code; its cells' middles are at ``pixels`` (c, 2).
 
-    Its border must be black, the quiet zone around white, and no other word of the dictionary
-    nearer. Of a marker that is ``tracked``, up to ``code.errors`` cells may be covered; of any
-    other, half as many may be wrong: a mirrored print differs in few cells. If one threshold for
-    all cells does not show that, a shadow may lie across: then each is compared with those around.
+    The border must be black, the quiet zone around it white, and no other word of the dictionary
+    nearer. If the marker is ``tracked``, up to ``code.errors`` cells may be covered; otherwise
+    half as many may be wrong, because a mirrored print differs in few cells. If the code does not
+    appear with one threshold for all cells, because of a shadow, each cell is compared with the
+    cells around it.
     """
     brightness = gray_levels(image, pixels)
     inner = code.bits.size
@@ -267,12 +268,12 @@ class EdgeModel:
     """
     The n edge points of all m markers of a neighbor, on its body (FLU), m.
 
-    ``places`` (n + c, 3) are the points, then the middles of the markers' cells. ``tangents``
-    (n, 3), unit, have black on the left and white on the right as one faces the marker.
-    ``axis`` (n,) is 0 for edges across the marker's x axis, 1 across y. ``room`` (n, 2): distance
-    to the next edge on the black side and on the white side, m. ``marker`` (n,) and
-    ``cell_marker`` (c,) are the index of the marker. Per marker: ``centers`` and ``facings``
-    (m, 3), its middle and its normal, and ``codes``.
+    ``places`` (n + c, 3) are the points, then the middles of the markers' cells. ``tangents`` (n,
+    3) are unit vectors with black on the left and white on the right, seen from the front.
+    ``axis`` (n,) is 0 for edges across the marker's x axis, 1 across y. ``room`` (n, 2) is the
+    distance to the next edge on the black side and on the white side, m. ``marker`` (n,) and
+    ``cell_marker`` (c,) are the indices of the markers. For each marker: ``centers`` and
+    ``facings`` (m, 3), its middle and its normal, and ``codes``.
     """
 
     def __init__(self, places: Array, tangents: Array, axis: Any, room: Array, marker: Any,

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Whether a marker in an image is the print that the file describes: its border, and which way up.
+Whether a marker in an image is the print in the neighbors file: its border, its orientation.
 
-Both look like the configured marker to a fit. A print with a border of two cells (Kalibr's) is
-fitted at a wrong distance. A print that is turned by a quarter or half turn gives a body that
-leans by as much, and a position that is wrong by its distance from the marker.
+The fit of the pose does not detect the two faults. A print with a border of two cells (Kalibr's)
+is fitted at a wrong distance. A print that is rotated by a quarter or half turn gives a body that
+is tilted by this angle, and a position of the body that is wrong by its distance from the marker.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def border_cells(image: GrayImage, corners: Array, dictionary: str, marker_id: i
 
 
 class Fault(NamedTuple):
-    """Why a marker is refused although it was found: one of REASONS, what is seen, the remedy."""
+    """Why a detected marker is refused: one of REASONS, the observation, the remedy."""
 
     reason: str
     seen: str
@@ -117,7 +117,7 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
 
 
 def border_sought(rounds: int) -> int:
-    """Return the border, cells, to search for after a number of whole images searched."""
+    """Return the border, cells, to search for after a number of searches of whole images."""
     which = rounds % _ROUNDS
     return BORDER_WIDTHS[which if which < len(BORDER_WIDTHS) else 0]
 
@@ -128,14 +128,14 @@ def lean(R_camera_body: Array, up: Array) -> float:
 
 
 def mounted_turned(marker: Marker, quarters: int) -> Array:
-    """Return the rotation of a marker on its body, (3, 3), turned left by quarters of a turn."""
+    """Return the rotation (3, 3) of a marker on its body, turned left by some quarter turns."""
     turned: Array = marker.T_body_marker.rotation @ rotation_vector_to_matrix(
         [0.0, 0.0, 0.5 * math.pi * quarters])
     return turned
 
 
 def turned_print(pose: Transform, up: Array | None, marker: Marker) -> Fault | None:
-    """Return the fault of a marker whose carrier does not fly upright, or None."""
+    """Return the fault of a marker if its body is not upright, or None."""
     angle = 0.0 if up is None else lean(pose.rotation, up)
     if up is None or angle <= MAX_LEAN:
         return None

@@ -15,10 +15,10 @@
 """
 Decides whether to use a measured distance, and estimates the constant error of a series of them.
 
-Noise has two signs, but a detour of radio waves only lengthens. A distance outside the gate that
-is too short gets the weight that puts it on the gate; if the next one is too short, too, the
-prediction is wrong, and its variance is raised. A distance that is too long is refused, until
-``most`` in a row were: then the prediction is wrong.
+Noise makes a distance longer or shorter, but a detour of radio waves only makes it longer. So a
+distance outside the gate that is too short is used with the weight of a distance on the gate; if
+the next one is also too short, the prediction is wrong, and its variance is increased. A distance
+that is too long is refused; after ``most`` refusals in a row the prediction is wrong.
 
 ``RangeBias`` learns the constant error (mostly antenna delays), a slow random walk, while the
 marker gives the true distance.
@@ -44,7 +44,7 @@ class RangeGate:
     """
     The gate of a series of distances.
 
-    :param most: at most one less than this number is refused in a row.
+    :param most: of so many too long distances in a row the last one is used.
     """
 
     def __init__(self, most: int = 6) -> None:
@@ -58,8 +58,8 @@ class RangeGate:
         """
         Judge a distance by its innovation, m, of variance ``spread``, m^2; None if it is refused.
 
-        Return the factor on the predicted variance, and the one on the variance of the innovation
-        after that: the noise is larger.
+        Return two factors: on the predicted variance, and then on the variance of the innovation,
+        because the noise is larger.
         """
         doubt = innovation * innovation / (spread * RANGE_GATE)
         inside = doubt <= 1.0  # NaN is not
@@ -95,8 +95,8 @@ class RangeBias:
         """
         Learn from a distance measured at a stamp, s, of a neighbor in sight.
 
-        :param excess: measured distance less that to the marker, m.
-        :param noise: variance of their difference but for the bias, m^2.
+        :param excess: measured distance minus the distance to the marker, m.
+        :param noise: variance of this difference without the bias, m^2.
         """
         prior, innovation = self.variance(stamp), excess - self.value
         factors = self.gate.judge(innovation, prior + noise)

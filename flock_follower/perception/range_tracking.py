@@ -15,14 +15,15 @@
 """
 Tracks a neighbor that is out of sight by distances that a radio measures.
 
-One sensor measures the distances to a neighbor: all of them have one bias, one place of the ego
-antenna, and stamps that only grow. A second sensor would need a series of its own.
+One sensor measures the distances to a neighbor: they have one bias, one place of the ego antenna,
+and increasing stamps. A second sensor would need a second series.
 
-In sight, a marker measures the distance a hundred times better; then only the error of the ranges
-is learned. Out of sight, a second filter continues from the state of the first. The second filter
-is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
-line of sight. Across it, the uncertainty grows with the neighbor's possible motion; once it
-exceeds the distance, the direction is unknown.
+In sight, the marker measures the distance a hundred times better than the radio, so only the error
+of the ranges is learned. Out of sight, a second filter continues from the state of the first
+filter. It is separate, so that ranges do not influence the first filter when the neighbor is seen
+again. Ranges limit the error of the state along the line of sight. Across this line the
+uncertainty grows with the neighbor's possible motion; once it exceeds the distance, the direction
+is unknown.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ Rejection = tuple[str, str]
 
 @dataclass(frozen=True)
 class RangingParams(Checked):
-    """Place of the ego antenna on the body, FLU, m; noise of ranges without a variance, m."""
+    """Place of the ego antenna on the body, FLU, m; noise, m, of ranges without a variance."""
 
     tag_position: tuple[float, float, float] = parameter(
         (0.0, 0.0, 0.0), Range(-5.0, 5.0, 'm'),
@@ -86,7 +87,7 @@ class Ranged(NamedTuple):
 
 
 class PlacedRange(NamedTuple):
-    """A range, by the filters' clock, s, and where the ego antenna was (3,), m, in their frame."""
+    """A range, its time on the filters' clock, s, and the ego antenna (3,), m, in their frame."""
 
     stamp: float
     distance: float
@@ -98,8 +99,8 @@ class Ranging:
     """
     Takes the ranges of all neighbors, and estimates the states of those out of sight.
 
-    :param filters: of the neighbors seen, by name: never altered here.
-    :param odometry: the ego one.
+    :param filters: of the neighbors seen, by name; not changed here.
+    :param odometry: the ego odometry.
     """
 
     def __init__(self, neighbors: Iterable[MarkedNeighbor], filters: Mapping[str, NeighborFilter],
@@ -119,7 +120,7 @@ class Ranging:
 
     @property
     def biases(self) -> dict[str, RangeBias]:
-        """Return the biases of the ranges to each neighbor that has sent ranges."""
+        """Return the bias of the ranges to each neighbor."""
         return {name: series.bias for name, series in self._series.items()
                 if series.newest > -math.inf}
 
@@ -130,7 +131,7 @@ class Ranging:
 
     def take(self, measured: RangeState, stamp: float) -> Rejection | None:
         """
-        Take a range, to be used by :meth:`due`; return why it is dropped, or None.
+        Take a range for :meth:`due`; return why it is dropped, or None.
 
         :param stamp: its stamp, s, by the clock of the odometry.
         """
@@ -171,7 +172,7 @@ class Ranging:
 
 
 class RangeSeries:
-    """The ranges to an antenna at ``tag`` (3,), m, on a neighbor tracked by camera."""
+    """The ranges to an antenna at ``tag`` (3,), m, on the body of a neighbor."""
 
     def __init__(self, seen: NeighborFilter, tag: Array) -> None:
         self._seen, self._tag = seen, tag

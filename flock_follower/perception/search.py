@@ -15,11 +15,11 @@
 """
 Searches an image for markers: near an expected place, or everywhere; quickly, or thoroughly.
 
-A quick search is OpenCV's detector, which needs an unbroken outline and reads all cells by one
-threshold. A thorough search finds given markers although a shadow's edge lies across them or a
-reflex hides a part. It works on the logarithm of the image: a shadow then darkens black and white
-by the same amount, whatever its depth. The outline is the convex hull of a dark part; a side that
-a reflex has bitten into it is replaced by prolonging its neighbors.
+A quick search is OpenCV's detector, which needs a complete outline, and reads all cells with one
+threshold. A thorough search finds given markers even if the edge of a shadow crosses them, or a
+reflex covers a part. It uses the logarithm of the image, in which a shadow darkens black and white
+by the same amount. The outline is the convex hull of a dark region; if a reflex has cut a side,
+this side is removed, and the two adjacent sides are extended.
 """
 
 from __future__ import annotations
@@ -109,7 +109,8 @@ def everywhere(image: GrayImage, dictionary: str, markers: Sequence[Marker] | No
     """
     Return the markers in an image.
 
-    :param markers: those to look for thoroughly; None: all of the dictionary, quickly.
+    :param markers: the markers for a thorough search; None: a quick search for the whole
+        dictionary.
     :param border: of a quick search, see ``markers.detect``.
     :param windows: of a thorough search, as _SEARCH_WINDOWS.
     """
@@ -123,7 +124,8 @@ def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number
     """
     Return the markers that one portion of a search of the whole image finds.
 
-    :param number: below :data:`N_PORTIONS`; 0 is a quick search for all markers of the dictionary.
+    :param number: of the portion, below :data:`N_PORTIONS`; 0 is a quick search for the whole
+        dictionary.
     """
     if number == 0:
         return everywhere(image, dictionary, border=border)

@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Fits the pose of a marker that motion has blurred so much that its edges run into one another.
+Fits the pose of a marker that motion has blurred so much that its edges overlap.
 
-If a camera or a marker moves by up to one and a half cells while an image is exposed, the image
-has no edges left. But the blur by a motion is known: each point of the image is the mean over a
-line in the print. The print, blurred by a vector, is therefore compared with the image: first at
-several places and for several vectors, then, from the best of them, by Gauss-Newton on the pose,
-the vector and the camera's response to light.
+If a camera or a marker moves by up to one and a half cells during the exposure, the image has no
+sharp edges. But the effect of motion is known: each point of the image is the mean over a line in
+the print. So the print, blurred along a vector, is compared with the image: first at several
+places and for several vectors; then, from the best of them, Gauss-Newton refines the pose, the
+vector and the camera's response to light.
 
 Lengths on a marker are in cells: (0, 0) is the middle of its first black cell, x right, y down.
 """
@@ -117,7 +117,7 @@ _REGULAR_INFORMATION = np.diag([0.0] * 9 + [_UNEVEN_LIGHT**-2] * 3 + [0.0, 0.0])
 
 
 class SmearStart(NamedTuple):
-    """Pose, smear and blur to descend from, as in :class:`SmearFit`."""
+    """Pose, smear and blur at which the descent begins, as in :class:`SmearFit`."""
 
     pose: Transform
     smear: Array
@@ -153,7 +153,7 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
     """
     Return the pose of a marker near ``start``, ``T_camera_body``, or None if it is not there.
 
-    ``start`` may be off by two cells and a half, and a little in all else.
+    ``start`` may be off by two cells and a half in the image plane, and by a little otherwise.
     """
     begin = seek(image, camera, model, start)
     return None if begin is None else descend(image, camera, model, begin)
@@ -164,7 +164,7 @@ def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
     """
     Return the shifted pose, smear and blur with which the print correlates best.
 
-    ``start`` may be off by two cells and a half. None if the image resembles the print nowhere.
+    ``start`` may be off by two cells and a half. None if no part of the image resembles the print.
 
     :param near: whether ``start`` is probably off by less than a cell: a search there is cheaper.
     """
@@ -288,7 +288,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
     """
     Return the fit with the least weighted squares near a pose and a smear.
 
-    :param known: whether smear and lens are of a fit, to this image or to the preceding one.
+    :param known: whether smear and lens come from a fit to this image or to the previous image.
     """
     pose, smear, lens = start
     weights, variance, response = np.ones(model.places.shape[1]), _MIN_VARIANCE, None

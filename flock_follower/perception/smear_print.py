@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The print of a marker as motion smears it, and at which places it is compared with an image.
+The print of a marker as motion smears it, and the points at which it is compared with an image.
 
-If a camera or a marker moves while an image is exposed, each point of the image is the mean over a
-line in the print: the mean over some instants of the exposure.
+If a camera or a marker moves during the exposure, each point of the image is the mean over a line
+in the print: here the mean over some instants of the exposure.
 
 Lengths on a marker are in cells: (0, 0) is the middle of its first black cell, x right, y down.
 """
@@ -72,17 +72,16 @@ class SmearModel:
 
     ``origin`` (3,) and ``axes`` (2, 3), m: place of (0, 0) on the body, and steps of one cell.
     ``places`` (3, s) are the sample points, row by row: column and row, cells, and 1; ``texels``
-    (2, s) are the same in texels. ``around`` are more sample points, (3, a), by the samples that
-    they reach beyond. ``middle`` (3,) of the marker on the body; ``from_middle`` (2, s), cells:
-    how far off it ``places`` are; ``across`` (2, s) is -0.5 to 0.5 across the marker.
-    ``cell``, m, is the length of a cell.
-    ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
-    for each of :data:`LENS_BLURS`.
-    ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
-    ``smeared`` (t, s) the samples under them, of mean 0 and norm 1. ``bits`` (b,), 0..1: the
-    inner cells. ``flips`` (w, b) is 1 for each cell in which another codeword, in any rotation,
-    differs from them; up to ``errors`` cells may be misread: half of those that can be corrected.
-    ``cells``: number of cells along a side, with the black border.
+    (2, s) are the same in texels. ``around`` are more sample points, (3, a), outside the others.
+    ``middle`` (3,) of the marker on the body; ``from_middle`` (2, s), cells: how far off it
+    ``places`` are; ``across`` (2, s) is -0.5 to 0.5 across the marker. ``cell``, m, is the length
+    of a cell. ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right
+    and down, for each of :data:`LENS_BLURS`. ``smears`` (t, 2), cells, are the vectors tried
+    first, with blur ``lenses`` (t,); ``smeared`` (t, s) are the samples with this smear, of mean 0
+    and norm 1. ``bits`` (b,), 0..1, are the inner cells. ``flips`` (w, b) is 1 for each cell in
+    which another codeword, in any rotation, differs from ``bits``. Up to ``errors`` cells may be
+    misread: half of the number that can be corrected. ``cells`` is the number of cells along a
+    side, with the black border.
     """
 
     def __init__(self, marker: Marker, dictionary: str) -> None:

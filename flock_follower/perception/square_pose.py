@@ -34,7 +34,7 @@ from flock_follower.perception.measurement import SAME_ATTITUDE
 
 
 def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
-    """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
+    """Return the two closed-form poses ``T_camera_marker`` from corners (4, 2), px, if any."""
     normalized = camera.undistort(corners)
     if not np.all(np.isfinite(normalized)):
         return []
@@ -59,8 +59,8 @@ def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
     """
     Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
 
-    The second value is the Jacobian (8, 6), px per m and rad. Of ``points`` (4, 3) on a body, m,
-    ``corners`` (4, 2) are seen, px; a step turns the body about ``center`` (3,), m.
+    The second value is the Jacobian (8, 6), px per m and rad. ``corners`` (4, 2), px, are the
+    images of ``points`` (4, 3) on a body, m. A step rotates the body about ``center`` (3,), m.
     """
     for _ in range(20):
         seen = pose.apply(points)
@@ -82,7 +82,7 @@ def mirror(pose: Transform, center: Array, facing_along: Array) -> Transform | N
     """
     Return a pose mirrored about the line of sight; None if it is the same.
 
-    :param center: of the marker (3,), in the camera's optical frame, m, which stays in place.
+    :param center: of the marker (3,), in the camera's optical frame, m; it does not move.
     :param facing_along: the marker's normal (3,) on the body.
     """
     normal, sight = pose.rotation @ facing_along, center / np.linalg.norm(center)

@@ -15,16 +15,16 @@
 """
 Estimates the offset between the camera's stamps and the odometry's clock.
 
-An image of stamp t was exposed at t + offset on the odometry's clock. The measured points of a
-neighbor, taken to odom with the ego poses at t + offset, are a smooth path only with the true
-offset: otherwise the rotation of the ego vehicle moves them.
+An image of stamp t was exposed at t + offset on the odometry's clock. If the measured points of a
+neighbor are transformed to odom with the ego poses at t + offset, they form a smooth path only
+with the true offset: with another offset the rotation of the ego vehicle moves the points.
 
-Every ``BATCH`` seconds, the points of each neighbor are taken to odom with each offset of a grid.
-The misfit of an offset is the chi^2 of a path that begins with any position, velocity and
-acceleration and is driven by white jerk. No offset of the grid is preferred, and nothing is
-linearized: offsets of any size inside the grid are found alike, whatever is applied meanwhile.
-The misfits of all batches are added, old ones forgotten. The deviation comes from their curvature
-and from the least of them, so unmodeled motion and noise make it larger.
+Every ``BATCH`` seconds, the points of each neighbor are transformed to odom with each offset of a
+grid. The misfit of an offset is the chi^2 of a path with any initial position, velocity and
+acceleration, driven by white jerk. No offset of the grid is preferred, and nothing is linearized,
+so every offset inside the grid is found, whatever offset is applied meanwhile. The misfits of all
+batches are added; old misfits are forgotten. The standard deviation follows from the curvature and
+the least of the misfits, so unmodeled motion and noise increase it.
 
 ``MountedCamera`` holds what belongs to one camera on the body: mounting, clock, learned noise, and
 its last searches.
@@ -109,7 +109,7 @@ class TimeOffset:
     def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
              odometry: OdometryBuffer) -> float:
         """
-        Take where a camera saw a neighbor; return by how much the applied offset changed, s.
+        Take the place where a camera saw a neighbor; return the change of the applied offset, s.
 
         :param time: of the exposure by the camera's clock, s.
         :param camera_point: a point of the neighbor, (3,), m, in the optical frame.
@@ -159,10 +159,10 @@ class TimeOffset:
 
 def fit_offset(misfits: Array, freedom: float) -> tuple[float, float]:
     """
-    Return the likeliest offset about the initial one, s, and its widened standard deviation.
+    Return the most likely offset, s, relative to the initial one, and its standard deviation.
 
-    :param misfits: of each offset of OFFSET_GRID, in any unit: the least is that of the noise.
-    :param freedom: number of values that were measured less that of those fitted.
+    :param misfits: of each offset of OFFSET_GRID, in any unit; the least is the misfit by noise.
+    :param freedom: number of measured values minus number of fitted values.
     """
     chi2 = misfits * (freedom / misfits.min()) + (OFFSET_GRID / INITIAL_DEVIATION)**2
     best = int(chi2.argmin())
@@ -200,7 +200,7 @@ class MountedCamera:
 
     :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
-    :param attitude_noise: of the ego attitude as its images show it, before it is learned, rad.
+    :param attitude_noise: initial noise of the ego attitude in its images, rad.
     :param rectified: whether its images are undistorted already.
     """
 
@@ -239,6 +239,6 @@ class MountedCamera:
         """The last measurement of each neighbor."""
 
     def take_stamp(self, stamp: float) -> None:
-        """Take that an image of a stamp, s, is there: once or several times."""
+        """Record that an image of a stamp, s, has arrived; repetitions are ignored."""
         if stamp != self.newest:
             self.newest, self.interval = stamp, abs(stamp - self.newest)

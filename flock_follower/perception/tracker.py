@@ -23,7 +23,7 @@ roi      a neighbor not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, a portion in each image
 =======  ==========================================================================
 
-Once a second the whole image is searched even if none is missing: see ``hypotheses``.
+Once a second the whole image is searched even if no neighbor is missing, see ``hypotheses``.
 """
 
 from __future__ import annotations
@@ -116,12 +116,13 @@ class Tracker:
     """
     The neighbors of one drone, seen by one camera or several.
 
-    The tracker needs every odometry message, and each image once :meth:`missing` returns None for
-    its stamp. A single camera has the name ''. All times of filters are by the odometry's clock.
+    Pass every odometry message to the tracker, and each image once :meth:`missing` returns None
+    for its stamp. A single camera has the name ''. All times of filters are on the odometry's
+    clock.
 
-    :param cameras: by name; of a single one its place on the body (optical) is enough.
-    :param alone: whether there is no odometry: every image is then taken from the origin, by a
-        camera of unknown attitude, and all states are relative to the camera.
+    :param cameras: by name; for a single camera its place on the body (optical) is enough.
+    :param alone: whether there is no odometry: the camera is then always at the origin, with an
+        unknown attitude, and all states are relative to the camera.
     """
 
     def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
@@ -202,7 +203,7 @@ class Tracker:
         """
         Return whether to decode and process the image of a stamp, s.
 
-        With one camera always; with several cameras, only if a neighbor may be in the image.
+        With one camera always True; with several cameras only if a neighbor may be in the image.
         """
         source = self.cameras[camera]
         source.take_stamp(stamp)
@@ -217,7 +218,7 @@ class Tracker:
         """
         Return the estimates of the neighbors from an image (H, W) uint8 of a stamp, s.
 
-        :raises ValueError: if the image is not of the camera's size, or not gray.
+        :raises ValueError: if the image has not the camera's size, or is not gray.
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')

@@ -15,8 +15,9 @@
 """
 Topics and log of the MAVLink bridge; its diagnostics are in ``bridge_problems``.
 
-The setpoint thread calls ``on_messages`` and ``on_cycle``, which decide from the bridge's state
-and pass functions to the publisher thread; events for the diagnostics wait for the executor's.
+The setpoint thread calls ``on_messages`` and ``on_cycle``. They decide from the bridge's state,
+and pass functions to the publisher thread; the executor's thread takes the events for the
+diagnostics.
 """
 
 from __future__ import annotations

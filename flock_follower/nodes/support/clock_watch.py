@@ -15,8 +15,8 @@
 """
 Steps of the system clock: stamps are corrected if it is set, for example by NTP.
 
-A message's stamp is of the system clock, which may jump; the monotonic clock never does. The
-caller reads both clocks at the same time and passes both times.
+The stamp of a message is on the system clock, which may jump; the monotonic clock never jumps. The
+caller reads both clocks at the same time, and passes both times.
 """
 
 from __future__ import annotations

@@ -84,10 +84,10 @@ def percentiles(name: str, durations: Collection[float]) -> dict[str, str]:
 
 class Input:
     """
-    One subscribed topic; it finds the reason for a silence.
+    One subscribed topic; finds the reason why no message arrives.
 
-    :param required: whether silence is a fault. :param sporadic: it is none while a publisher is
-        there that sends nothing.
+    :param required: whether silence is a fault. :param sporadic: whether silence is no fault
+        while there is a publisher.
     """
 
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile, required: bool,
@@ -132,10 +132,11 @@ class Diagnostics:
     """
     The diagnostics of one node.
 
-    ``counters`` are the rejections by reason, ``values`` what a node sets. At each publication
+    ``counters`` are the rejections by reason; the node sets ``values``. At each publication
     ``checks`` return a problem ``(level, message)`` or None, and ``sources`` return more values,
-    both at a monotonic time, s; one that raises is an internal error and hides no other. The
-    status shows the worst problem; every problem is also logged at most once per 5 s.
+    both at a monotonic time, s. An exception in one of these functions is reported as an internal
+    error, and the others are still called. The status shows the worst problem; every problem is
+    also logged, at most once per 5 s.
     """
 
     def __init__(self, node: Node) -> None:
@@ -153,7 +154,7 @@ class Diagnostics:
 
     def watch(self, topic: str, msg_type: Any, qos: QoSProfile, required: bool,
               sporadic: bool) -> Input:
-        """Return an :class:`Input` whose silence shows in the status."""
+        """Return an :class:`Input` whose silence is reported in the status."""
         type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
         watched = Input(self._node, topic, type_name, qos, required, sporadic)
         self.checks.append(watched.problem)
@@ -174,7 +175,7 @@ class Diagnostics:
         self.log(WARN, f'{reason}: {detail}' if detail else reason, key=reason)
 
     def internal_error(self, where: str, error: Exception) -> None:
-        """Count an unexpected exception; show and log it with its place."""
+        """Count an unexpected exception; report and log its type, message and place."""
         reason = f'internal error {where}'
         message = internal_error(error, where)
         if places := traceback.extract_tb(error.__traceback__):

@@ -43,11 +43,11 @@ class EvenClock(ClockWatch):
         return system - self.clock_shift
 
     def dated(self, stamp: int, arrival: int) -> int:
-        """Return a stamp of a message, ns, on this clock, and no later than its arrival."""
+        """Return a message's stamp, ns, on this clock, but no later than the message's arrival."""
         return stamp if self.simulated else min(stamp, arrival) - self.clock_shift
 
     def fresh(self, topic: str, stamp: int) -> bool:
-        """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
+        """Return whether a stamp, ns, can be used; count the stamp if it is from before a step."""
         fresh = self.simulated or not self.before_step(stamp)
         if not fresh:
             self._node.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')

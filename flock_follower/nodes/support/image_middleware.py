@@ -31,9 +31,9 @@ IMAGES_BUFFER: Final = 4 * 1024 * 1024
 
 def avoid_shared_memory_for_images(environment: MutableMapping[str, str], most: int) -> bool:
     """
-    Do as ``avoid_shared_memory``, with a buffer for images; return whether the kernel allows it.
+    As ``avoid_shared_memory``, with a buffer for images; return whether the kernel allows it.
 
-    Otherwise nothing is changed: without the buffer an image of 300 kB rarely arrives whole.
+    If not, nothing is changed: without the buffer an image of 300 kB rarely arrives completely.
 
     :param most: the largest receive buffer that the kernel allows, bytes.
     """

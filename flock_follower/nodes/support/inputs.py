@@ -46,7 +46,7 @@ def for_each(messages: Iterable[Any], take: Callable[[Any], None]) -> None:
     """
     Take each of several messages.
 
-    :raises ValueError: the first that ``take`` raised; all others are taken.
+    :raises ValueError: the first error of ``take``; all other messages are taken.
     """
     invalid: ValueError | None = None
     for message in messages:
@@ -106,8 +106,8 @@ class OwnOdometry:
     Subscribes ``odom``; counts dropped messages, and reports the frames in use.
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
-    :param use: is called with the ego state, of base_link, and the arrival of its message, ns;
-        both on the node's clock, or on ``clock`` if one is given.
+    :param use: is called with the ego state, of base_link, and the time of arrival of its message,
+        ns; both times are on the node's clock, or on ``clock`` if given.
     :raises ValueError: if a parameter is out of range.
     """
 

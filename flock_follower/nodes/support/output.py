@@ -25,8 +25,9 @@ def never_block_output() -> None:
     """
     Make writes to stdout and stderr fail instead of waiting for a reader.
 
-    Otherwise a terminal stopped by Ctrl-S, a hung ssh or a full pipe would stop the process at its
-    next log line. If a write fails, the line is lost. Output to files is not changed.
+    Otherwise a terminal that is stopped by Ctrl-S, a broken ssh connection or a full pipe would
+    stop the process at its next log line. If a write fails, the line is lost. Output to files is
+    not changed.
     """
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):

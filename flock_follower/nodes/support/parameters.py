@@ -15,10 +15,10 @@
 """
 Parameters of a node: declared in one table, validated in one place, settable while flying.
 
-A node has its parameters as a table of ``Spec`` and gives a ``build`` function that turns the
-values into one frozen object of the pure core; both stand beside what they configure. Every
-value, from the command line, a file or ``ros2 param set``, passes the same checks; a change is
-taken whole or refused with a reason that names the parameter, its value and the valid range.
+A node has a table of ``Spec``, and a ``build`` function that makes one frozen object of the pure
+core from the values; both are in the folder of the code that they configure. Every value, from the
+command line, a file or ``ros2 param set``, passes the same checks. A change is applied completely,
+or refused with the parameter, its value and the valid range.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def refuse_in_flight(start: Mapping[str, Any], now: Mapping[str, Any],
     """
     Refuse changes that would loosen the limits of a flight.
 
-    ``a_max`` and ``v_max`` never exceed their values at the start, and are only lowered while
-    flying. ``guard`` is not switched off while flying.
+    ``a_max`` and ``v_max`` never exceed their values at the start; while flying they can only be
+    lowered. ``guard`` cannot be switched off while flying.
 
     :param start: values at the start of the node; :param now: values before the change.
     :raises ValueError: naming the parameter, its value and the valid range.
@@ -77,12 +77,12 @@ class Parameters(Generic[T]):
     The declared parameters of a node and the object built from them.
 
     ``values`` is the dictionary of the current values, ``current`` the result of ``build``.
-    ``build`` raises ValueError for values that do not fit together (d0 above d1); the change is
-    then refused with that reason.
+    ``build`` raises ValueError for values that contradict each other (d0 above d1); the change is
+    then refused with this reason.
 
     :param flying: returns whether the vehicle flies by this node; see ``refuse_in_flight``.
-    :param elsewhere: names of parameters of other nodes, which a parameter file sets for all
-        nodes: the node does not declare them.
+    :param elsewhere: names of other nodes' parameters that a parameter file sets for all nodes;
+        this node does not declare them.
     :raises ValueError: at construction, for an invalid or an unknown parameter override.
     """
 
@@ -110,7 +110,7 @@ class Parameters(Generic[T]):
         """
         Return the parameters converted to their declared types.
 
-        :raises ValueError: if one is invalid, or they do not fit together.
+        :raises ValueError: if a parameter is invalid, or the parameters contradict each other.
         """
         # Of the others rclpy refuses those that are unknown or not live.
         changes = {p.name: self._specs[p.name].check(p.value) for p in parameters

@@ -55,8 +55,8 @@ class PoseInputs:
     Subscribes each topic once its type is known, and passes on what arrives.
 
     :param process: is called after each message.
-    :raises ValueError: if a transform is wanted and tf2_msgs is not installed, or a topic is to
-        have two uses.
+    :raises ValueError: if ``tf_frame`` is set and tf2_msgs is not installed, or a topic has two
+        uses.
     """
 
     def __init__(self, node: FlockNode, perceiver: Perceiver, process: Callable[[], None],
@@ -165,7 +165,7 @@ class PoseInputs:
         self._process()
 
     def judge(self, outcome: Sourced) -> None:
-        """Take the outcome of a pose, for the reports of latency and outliers."""
+        """Record the outcome of a pose, for the reports of latency and outliers."""
         refused = any(reason == UpdateOutcome.OUTLIER.value
                       for reason, _ in outcome.sighting.rejections)
         now = self._node.get_clock().now().nanoseconds

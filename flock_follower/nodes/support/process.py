@@ -65,9 +65,9 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     """
     Run one node until Ctrl-C, SIGTERM, SIGHUP or its own end; return the process's exit code.
 
-    ``factory`` creates the node; a ValueError or OSError it raises (a bad parameter, a missing
-    file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
-    ``args`` None: the arguments of the process. With ``--help`` it prints the help and ends.
+    ``factory`` creates the node. If it raises a ValueError or OSError (a bad parameter, a missing
+    file), the function prints one line on stderr and returns 1. ``spin`` may return another exit
+    code. ``args`` None: the arguments of the process. ``--help`` prints the help.
     """
     arguments = sys.argv[1:] if args is None else args
     own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
@@ -158,7 +158,7 @@ def _skip_message_generator() -> None:
 
 
 def unwritable_logs(environment: Mapping[str, str]) -> str:
-    """Return why ROS, started with an environment, cannot write a log file; '' if it can."""
+    """Return why ROS with this environment cannot write a log file; '' if it can."""
     get, home = environment.get, environment.get('HOME', '')
     name = get('ROS_LOG_DIR') or f'{get("ROS_HOME") or "~/.ros"}/log'
     if name.startswith('~') and not home:

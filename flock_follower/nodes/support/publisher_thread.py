@@ -32,12 +32,11 @@ class PublisherThread:
     """
     Runs the actions that another thread submits, in order, in a separate thread.
 
-    A publisher or a log line may wait for a socket, a disk or a lock of rclpy. ``submit`` waits
-    for none of them: it takes no lock and makes no system call. (An executor would have to be
-    woken by a guard condition, which takes locks of rclpy and of the middleware.) A thread does
-    not help against one thing: rclpy holds the GIL inside ``publish`` and log calls, so a write
-    that the middleware itself blocks stops the whole process. Publishers that keep the last few
-    messages do not block.
+    A publisher or a log line may wait for a socket, a disk or a lock of rclpy. ``submit`` does not
+    wait: it takes no lock and makes no system call. (To wake an executor, a guard condition would
+    take locks of rclpy and the middleware.) The thread has one limit: rclpy holds the GIL in
+    ``publish`` and log calls, so the whole process stops if the middleware blocks a write.
+    Publishers that keep the last few messages do not block.
 
     :param on_error: called in the thread with an exception that an action raises.
     """
@@ -54,7 +53,7 @@ class PublisherThread:
         self._thread.start()
 
     def submit(self, action: Callable[[], None]) -> None:
-        """Queue an action for the thread, without waiting; call it from one other thread only."""
+        """Queue an action for the thread, without waiting; only one other thread may call this."""
         if self._waiting.qsize() >= MOST_WAITING:
             with contextlib.suppress(queue.Empty):
                 self._waiting.get_nowait()
@@ -62,7 +61,7 @@ class PublisherThread:
         self._waiting.put(action)
 
     def stop(self) -> None:
-        """Run the actions that still wait, for at most EXIT_TIMEOUT, and end the thread."""
+        """Run the queued actions, for at most EXIT_TIMEOUT, and end the thread."""
         self._waiting.put(None)
         self._thread.join(EXIT_TIMEOUT)
 

@@ -35,8 +35,8 @@ class RemoteParameters:
     """
     Parameters of another node; ``values`` is None until it has answered.
 
-    :param other: its name, in the namespace of ``node`` unless it begins with /.
-    :param changed: is called with the values if they differ from those before.
+    :param other: the other node's name, in the namespace of ``node`` unless it begins with /.
+    :param changed: is called with the values if they differ from the values before.
     """
 
     def __init__(self, node: Node, other: str,
@@ -73,9 +73,9 @@ class RemoteParameters:
 
 class WatchedParameters(RemoteParameters):
     """
-    Parameters of another node, asked for every ``WATCH_PERIOD``; a change in flight is a problem.
+    Parameters of another node, read every ``WATCH_PERIOD``; a change in flight is a problem.
 
-    The other node may have been started anew with another file meanwhile.
+    The other node may have been restarted with another file.
 
     :param flying: whether the vehicle flies, or may fly.
     """

@@ -61,8 +61,8 @@ class Waiting(CallbackGroup):
     """
     A group of subscriptions that the executor serves only while ``awaited`` returns True.
 
-    Otherwise their messages wait until a node takes them. The result of ``awaited`` may change in
-    the executor's thread only: the executor asks each time before it waits.
+    Otherwise their messages wait until the node takes them. Only the executor's thread may change
+    the result of ``awaited``: the executor calls it each time before it waits.
     """
 
     def __init__(self, awaited: Callable[[], bool] = lambda: False) -> None:
@@ -85,14 +85,13 @@ class FlockNode(Node):
     """
     A node with validated parameters, diagnostics, and callbacks that cannot kill it.
 
-    An exception of a callback of a subscription, a timer or a service counts in /diagnostics as
-    an internal error and is logged at most once per 5 s; the node lives on. That holds for the
-    callbacks of rclpy itself, too: ``/clock`` and the services of the parameters. Entities have no
-    QoS events: to wait for them took a third of the time of every wait, and ``diagnostics.Input``
-    finds what does not fit.
+    An exception in a callback of a subscription, a timer or a service is counted on /diagnostics
+    as an internal error, and logged at most once per 5 s; the node continues. The same holds for
+    callbacks of rclpy: ``/clock`` and the services of the parameters. Entities have no QoS events:
+    they took a third of the time of every wait, and ``diagnostics.Input`` finds a QoS mismatch.
 
-    ``parameter_files`` are those of the command line; ``run`` sets them. rclpy is silent if none
-    of their sections is for the node.
+    ``parameter_files`` are the files of the command line; ``run`` sets them. rclpy does not warn
+    if none of their sections is for the node.
     """
 
     parameter_files: ClassVar[Sequence[str]] = ()
@@ -107,7 +106,7 @@ class FlockNode(Node):
         """
         Declare the node's parameters; see :class:`Parameters`.
 
-        :raises ValueError: also for a parameter file that seems to mean the node and misses it.
+        :raises ValueError: also if a parameter file has a section that is nearly for this node.
         """
         name = self.get_fully_qualified_name()
         self.diagnostics.values[PARAMETER_FILES] = ', '.join(self.parameter_files)
@@ -142,11 +141,11 @@ class FlockNode(Node):
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
-        A ValueError is an invalid message and counts under its topic; any other exception counts
-        as an internal error with its place. The silence of a ``required`` topic shows in
-        /diagnostics with the reason. ``informed``: the callback gets rclpy's message info, too. A
-        message of more than ``largest`` bytes is refused before it is deserialized, and counted;
-        None: any size is taken.
+        A ValueError is counted as an invalid message of the topic, any other exception as an
+        internal error with its place. If a ``required`` topic is silent, /diagnostics has the
+        reason. ``informed``: whether the callback also gets rclpy's message info. A message of
+        more than ``largest`` bytes is refused before it is deserialized, and counted; None: no
+        limit.
         """
         take = self._taker(
             msg_type, topic, callback if informed else lambda message, _: callback(message),
@@ -165,9 +164,9 @@ class FlockNode(Node):
 
         ``callback`` gets each message and its time of arrival, ns of this node's clock. At 200 Hz
         an executor that wakes for every message takes 19 % of a core, polling 4 %. While
-        ``awaited`` returns True the executor wakes for messages and takes them. With
-        ``use_sim_time`` it always does: the rate of that time is unknown, and so is the time of
-        arrival of a message that has waited.
+        ``awaited`` returns True, the executor wakes for each message. With ``use_sim_time`` the
+        executor always wakes: the rate of the simulated time is unknown, so the time of arrival of
+        a waiting message would be unknown.
         """
         simulated = bool(self.get_parameter('use_sim_time').value)
 
@@ -239,9 +238,9 @@ class FlockNode(Node):
     def create_timer(self, timer_period_sec: float, callback: Callable[..., Any],
                      *args: Any, **kwargs: Any) -> Timer:
         """
-        Create a timer as rclpy does, guarded, on steady time: setting the clock stops none.
+        Create a timer as rclpy does, guarded, on steady time: setting the clock does not stop it.
 
-        With ``use_sim_time`` it runs on that time, unless ``clock`` is given.
+        With ``use_sim_time`` the timer runs on ``/clock``, unless ``clock`` is given.
         """
         if kwargs.get('clock') is None and not self.get_parameter('use_sim_time').value:
             kwargs['clock'] = STEADY
@@ -272,7 +271,7 @@ def deserialize(msg_type: Any, data: bytes) -> Any:
     """
     Return the message of its bytes.
 
-    :raises ValueError: if the bytes are none of that type.
+    :raises ValueError: if the bytes are no message of the type.
     """
     try:
         return deserialize_message(data, msg_type)

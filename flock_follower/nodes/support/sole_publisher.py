@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A topic that only one node may publish: which nodes do, and with which parameter files."""
+"""A topic that only one node may publish: finds its publishers and their parameter files."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class SolePublisher:
     """
     Finds several publishers of a topic.
 
-    Only while there are several it subscribes ``/diagnostics``, where each of our nodes reports
-    its parameter files. The executor's thread calls it.
+    Only while there are several publishers, ``/diagnostics`` is subscribed, where each of our
+    nodes reports its parameter files. The executor's thread calls the methods.
     """
 
     def __init__(self, node: Node, topic: str) -> None:
