@@ -111,9 +111,10 @@ class Permission:
     received: float = math.inf
     """When the newest message with the mode was received since then, s, if any."""
     obeyed: bool = False
-    """Whether the vehicle has been in the mode that obeys setpoints since then. While INACTIVE:
-    whether the bridge fell silent while the mode was unknown, so that a switch of the pilot may
-    have gone unseen."""
+    """Whether the vehicle has been in the mode that obeys setpoints since then."""
+    unseen: bool = False
+    """Whether the bridge fell silent while the mode was unknown: the next mode shows whether the
+    pilot has switched."""
     cause: Cause | None = Cause.NOT_REQUESTED
     """The same for code; None if it is ACTIVE."""
     taker: Taker = UNKNOWN
@@ -181,7 +182,7 @@ class Permission:
         :param unseen: whether the pilot may have switched unseen: the next mode shows it.
         """
         return Permission(reason=why, since=self.since if unseen else math.inf,
-                          received=self.received, obeyed=unseen, cause=cause, taker=self.taker)
+                          received=self.received, unseen=unseen, cause=cause, taker=self.taker)
 
     def contest(self, who: str) -> Permission:
         """Brake, because two nodes publish commands."""
@@ -235,14 +236,14 @@ class Permission:
         :param airborne: whether the vehicle reports that it flies: on the ground setpoints could
             start a take-off. None: no report, so nothing is permitted.
         """
-        if not (self.streams or self.obeyed) or received <= self.since:
+        if not (self.streams or self.unseen) or received <= self.since:
             return self
         now = replace(self.follow_silence(received - self.received), received=received)
-        if now.phase in (Phase.GIVING_BACK, Phase.INACTIVE):
+        if now.phase is Phase.GIVING_BACK or now.unseen:
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
-            if status.armed and (now.taker == STICK or now.phase is Phase.INACTIVE or (
-                    now.cause is Cause.MODE_UNKNOWN)):
+            if status.armed and (
+                    now.taker == STICK or now.unseen or now.cause is Cause.MODE_UNKNOWN):
                 return now.leave_mode(status, now.taker)
             return now._stop_sending(f'given back ({now.reason})', Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):
