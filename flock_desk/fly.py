@@ -197,7 +197,8 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
     for namespace in namespaces(followers):
         flight = flights[namespace] = read_flown(scenario, out / namespace, namespace)
         summary = summaries[namespace] = scenario_figures(
-            flight, own(flown.cores, namespace), own(flown.exit_codes, namespace), flown.load)
+            flight, own(flown.cores, namespace), own(flown.exit_codes, namespace), flown.load,
+            flown.speed)
         demanded = scenario_bounds(flight, summary)
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in demanded]
         judgments = report(

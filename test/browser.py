@@ -59,8 +59,9 @@ class Browser:
         return self._loop.run_until_complete(task)
 
     async def _attach(self, port: int) -> None:
-        self._session = aiohttp.ClientSession()
+        self._session, end = aiohttp.ClientSession(), time.monotonic() + START_TIMEOUT
         while True:
+            assert time.monotonic() < end, 'Chromium shows no page'
             async with self._session.get(f'http://127.0.0.1:{port}/json/list') as reply:
                 pages = [one for one in json.loads(await reply.text()) if one['type'] == 'page']
             if pages:
@@ -73,7 +74,9 @@ class Browser:
         self._number += 1
         await self._socket.send_json(
             {'id': self._number, 'method': method, 'params': parameters})
+        end = time.monotonic() + START_TIMEOUT
         while True:
+            assert time.monotonic() < end, f'no answer to {method}'
             answer = await self._socket.receive_json(timeout=START_TIMEOUT)
             if answer.get('id') == self._number:
                 assert 'error' not in answer, answer

@@ -138,8 +138,10 @@ class Traffic:
         return data, r.choice(PEERS)
 
     def _valid(self):
+        deadline = self.autopilot.next_step + 10.0
         while not self._queue:
             self.now = self.autopilot.next_step
+            assert self.now < deadline, 'the autopilot sends no message'
             self._queue += self.autopilot.step(self.now)
         data = self._queue.popleft()
         self._recent.append(data)

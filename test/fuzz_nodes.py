@@ -116,7 +116,7 @@ class NodeUnderFire(Driven):
         """Ask for offboard until the vehicle flies the setpoints: before, no command gets far."""
         asking, deadline = None, time.monotonic() + 20.0
         while self.node._bridge.gate.permission.phase is not Phase.ACTIVE:
-            assert time.monotonic() < deadline
+            assert time.monotonic() < deadline, self.node._bridge.gate.permission
             time.sleep(0.005)
             self._exchange()
             asking = asking or self.call('offboard', data=True)

@@ -152,7 +152,11 @@ FIGURES: Final[dict[str, Figure]] = {
     'timings.wall_time_s': Figure('in all, s'),
     'timings.cpu_ms': Figure('CPU time, ms'),
     'cpu_cores': Figure('CPU, in cores', True),
-    'cpu_cores.total': Figure('all processes', True, fly=(None, 1.5), load=UNBOUNDED),
+    'cpu_cores.total': Figure('all processes', True),
+    # A processor of half the speed needs twice the cores for the same work.
+    'cpu_cores.at_reference': Figure('all processes, at cpu_speed 1', True, fly=(None, 1.5),
+                                     load=UNBOUNDED),
+    'cpu_speed': Figure('speed of a processor, as a share of the reference', True),
     'failed_processes': Figure('processes that did not end well', demo=(None, 0), fly=(None, 0)),
     'late_processes': Figure('processes cut off while they waited for a processor', demo=(None, 0),
                              fly=(None, 0), load=UNBOUNDED),

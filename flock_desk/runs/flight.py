@@ -41,6 +41,7 @@ from flock_desk.runs.processes import (
     SIH_TRUTH_PORT,
     wait_until,
 )
+from flock_desk.runs.yardstick import Yardstick
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.checks.processor import Load
 from flock_follower.gate.envelope import GateLimits
@@ -86,6 +87,8 @@ class Flown(NamedTuple):
     """See ``Processes.stop``."""
     load: Load | None
     """During the flight; None if it is unknown."""
+    speed: float | None
+    """Of a processor meanwhile, as a share of the reference, see ``yardstick``."""
     late: str
     """The step that was too late to complete the scenario; '' if it was completed."""
 
@@ -156,7 +159,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         try:
             engage(processes, fleet, external is not None)
             began = time.monotonic()
-            cores, late = watch(processes, duration, external is not None)
+            cores, speed, late = watch(processes, duration, external is not None)
             early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
             if early:
                 print(f'\nthe bridge has ended the flight: {early}', flush=True)
@@ -179,7 +182,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         for recorder, code in exit_codes.items():
             if code == 1 and recorder.endswith('recorder'):
                 raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
-        return Flown(cores, exit_codes, processes.load.worst(began), late)
+        return Flown(cores, exit_codes, processes.load.worst(began), speed, late)
 
 
 def engage(processes: Processes, fleet: Sequence[str], external: bool) -> None:
@@ -313,9 +316,12 @@ def take_off(processes: Processes) -> None:
                 raise
 
 
-def watch(processes: Processes, duration: float, external: bool) -> tuple[dict[str, float], str]:
+def watch(processes: Processes, duration: float, external: bool
+          ) -> tuple[dict[str, float], float | None, str]:
     """
-    Wait for the end of the scenario; return the cores of each process, and ``Flown.late``.
+    Wait for the end of the scenario; return the cores of each process, and speed and lateness.
+
+    The last two are those of ``Flown``.
 
     The simulator of an embedded vehicle ends with the scenario. That of an external one ends when
     the vehicle is disarmed, which is not waited for here; the scenario has also ended if the
@@ -323,7 +329,7 @@ def watch(processes: Processes, duration: float, external: bool) -> tuple[dict[s
 
     :raises RuntimeError: if the simulator ends early.
     """
-    late = ''
+    late, yardstick = '', Yardstick()
     simulators = simulators_of(processes)
     begin = now = time.monotonic()
     used = before = processes.cpu()
@@ -336,12 +342,13 @@ def watch(processes: Processes, duration: float, external: bool) -> tuple[dict[s
             late = 'the simulator does not keep up with the clock'
             break
         used = {**used, **processes.cpu()}
+        yardstick.sample(now)
         time.sleep(0.2)
     else:
         if external and not any(codes) and not ended_by_bridge(processes.log('mavlink_bridge')):
             raise RuntimeError('the simulator ended early')
     return {name: (used[name] - before[name]) / (now - begin)
-            for name in before if now > begin}, late
+            for name in before if now > begin}, yardstick.speed, late
 
 
 def ended_by_bridge(log: str) -> str:

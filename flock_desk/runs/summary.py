@@ -231,8 +231,8 @@ def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None],
 
 
 def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
-                     exit_codes: Mapping[str, int | None],
-                     load: Load | None = None) -> dict[str, Any]:
+                     exit_codes: Mapping[str, int | None], load: Load | None = None,
+                     speed: float | None = 1.0) -> dict[str, Any]:
     """
     Return the summary of ``fly``.
 
@@ -247,11 +247,13 @@ def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
     it did.
 
     :param cores: used by each process, empty if unknown.
+    :param speed: of a processor, as a share of the reference; None if unknown.
     """
     params, table, log = flight.scenario.flight, flight.table, flight.log
     times, leader_speeds = flight.speeds['leader']
     common = flight_figures(flight, exit_codes, load)
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
+    total = sum(cores.values()) if cores else None
     missed = common['planner']['missed_ticks'] * flight.params.period / flight.duration
     return jsonable({
         'scenario': flight.scenario.name,
@@ -274,7 +276,9 @@ def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
                       'ended_early': str(log['ended_early']) or None}
                      if flight.external else None),
         'skipped_images': int(log['skipped_images']),
-        'cpu_cores': {'total': sum(cores.values()) if cores else None,
+        'cpu_speed': speed,
+        'cpu_cores': {'total': total,
+                      'at_reference': total and speed and total * speed,
                       **dict(sorted(cores.items(), key=lambda item: -item[1]))}})
 
 

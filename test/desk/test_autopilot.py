@@ -187,6 +187,7 @@ def test_px4_shows_a_change_of_the_mode_in_its_stream(rate, least, most):
     flight.mode('AUTO.LAND')
     changed = flight.now
     while flight.last('CURRENT_MODE').custom_mode != PX4.modes['AUTO.LAND'].number:
+        assert flight.now < changed + 5.0, 'no CURRENT_MODE shows AUTO.LAND'
         flight.fly(0.01)
     assert least <= round(flight.now - changed, 3) <= most
 

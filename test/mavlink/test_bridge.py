@@ -47,6 +47,7 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
     # Nothing lets it follow again.
     assert not flight.bridge.requests.offboard(True, start).outcome.success
     while not flight.bridge.has_stopped(flight.now):
+        assert flight.now < start + 5.0, 'the bridge has not stopped'
         flight.fly(0.05)
         assert flight.kinds(1) == {'brake'}
     assert 0.2 < flight.now - start <= 1.0
@@ -88,7 +89,9 @@ def test_end_of_bridge_does_not_end_unreported_landing(personality):
     flight = Flight(personality)
     flight.engage()
     flight.bridge.requests.land(flight.now)
+    deadline = flight.now + 5.0
     while flight.mode != flight.modes.land:
+        assert flight.now < deadline, f'not {flight.modes.land}, but {flight.mode}'
         flight.fly(0.01)
     flight.bridge.stop(flight.now)
     assert flight.bridge.gate.flies and flight.bridge.has_stopped(flight.now)

@@ -33,6 +33,7 @@ def in_offboard_before_a_heartbeat_says_so(personality):
     flight.planner = EAST
     request = flight.bridge.requests.offboard(True, flight.now)
     while flight.mode != flight.modes.offboard:
+        assert flight.now < 10.0, f'not {flight.modes.offboard}, but {flight.mode}'
         flight.fly(0.01)
     assert request.outcome is None
     return flight, request

@@ -137,6 +137,7 @@ def test_a_refusal_tells_its_cause(goal, mode, since, message):
     vehicle = Vehicle(status, None, since)
     now = since
     while request.outcome is None:
+        assert now < since + 60.0, f'no outcome of {goal.name}'
         for time, event in decoded('px4_refusals'):
             if event.get_type() == 'EVENT' and now - 0.1 < time <= now and time < since + 0.5:
                 texts.add_event(event, time)

@@ -22,6 +22,7 @@ import select
 import socket
 import struct
 import termios
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -32,6 +33,7 @@ from flock_follower.mavlink.transport import (
     RETRY_PERIOD,
 )
 
+DEADLINE = 40.0  # s for anything awaited
 MISSING = ('No such file or directory (ENOENT): is it plugged in? `ls /dev/serial/by-id` lists '
            'what is there')
 IN_USE = ('another process uses /dev/ttyTEST: end it, or have a router share the port '
@@ -99,9 +101,11 @@ def test_what_does_not_fit_is_refused_whole(terminal):
     while transport.write(message):
         sent += 1
         assert sent < 1000
-    received = b''
+    received, deadline = b'', time.monotonic() + DEADLINE
     while len(received) < sent * len(message):
-        received += os.read(main, 65536)
+        assert time.monotonic() < deadline, f'{len(received)} of {sent * len(message)} bytes'
+        if select.select([main], [], [], 0.01)[0]:
+            received += os.read(main, 65536)
         transport.is_congested()  # which sends what waits
     assert received == sent * message
     assert not transport.is_congested() and transport.write(b'x')

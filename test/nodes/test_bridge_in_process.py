@@ -129,7 +129,10 @@ class Bench(Driven):
 
     def setpoint(self) -> Any:
         """Return the next setpoint on the wire."""
+        end = time.monotonic() + DEADLINE
+        self.wire.settimeout(DEADLINE)
         while True:
+            assert time.monotonic() < end, 'no setpoint is sent'
             for message in self.codec.parse_buffer(self.wire.recv(4096)) or []:
                 if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
                     return message
@@ -193,8 +196,9 @@ def test_command_leaves_in_ned_and_refused_one_is_counted(make_bench):
     bench.fly()
     bench.odometry()
     bench.command(number=1)
+    end = time.monotonic() + DEADLINE
     while (sent := bench.setpoint()).afy != pytest.approx(0.3):
-        pass
+        assert time.monotonic() < end, f'no command is sent, but {sent}'
     assert (sent.type_mask, sent.coordinate_frame, sent.afx, sent.yaw) == (
         0x83F, mavlink.MAV_FRAME_LOCAL_NED, 0.0, pytest.approx(math.pi / 2))
     bench.command(east=math.nan, number=2)

@@ -111,8 +111,9 @@ def test_coasting_turns_after_it_then_looks_back_then_around() -> None:
     for tick in range(10):
         follower.tick(seen(follower.now, [2.0, 0.06 * tick, 2.0], (0.0, 0.6, 0.0)))
     before = follower.yaw
-    while follower.tick().state is not State.HOLD:
-        pass
+    coasting = follower.now
+    while (state := follower.tick().state) is not State.HOLD:
+        assert follower.now < coasting + 60.0, f'not HOLD, but {state}'
     assert follower.yaw > before + 0.1  # it went on to the left
     towards = follower.yaw
     turned = []

@@ -116,7 +116,7 @@ def test_an_empty_graph_is_one_line_and_ctrl_c_ends_it() -> None:
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     end = time.monotonic() + DEADLINE
     while len(list(Path(f'/proc/{command.pid}/task').iterdir())) < 10:  # the middleware's
-        assert time.monotonic() < end
+        assert time.monotonic() < end, 'check has not started its middleware'
         time.sleep(0.02)
     command.send_signal(signal.SIGINT)
     out, error = command.communicate(timeout=DEADLINE)

@@ -38,6 +38,7 @@ from flock_desk.runs.judge import flat, judge
 from flock_desk.runs.processes import free_udp_port, LateError, Processes
 from flock_desk.runs.record import LiveFlight, read_flown
 from flock_desk.runs.summary import scenario_figures
+from flock_desk.runs.yardstick import REFERENCE, Yardstick
 from flock_desk.scenarios.scenario import Outage, Scenario
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.checks.processor import Load
@@ -85,9 +86,9 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
             'duration': 10.0, 'ended_early': '', **elsewhere, **(external or {})})
 
 
-def judged(flight, cores={'planner': 0.1}):  # noqa: B006
+def judged(flight, cores={'planner': 0.1}, speed=1.0):  # noqa: B006
     """Return the figures, and what is wrong with them, each by key."""
-    summary = scenario_figures(flight, cores, {'planner': 0})
+    summary = scenario_figures(flight, cores, {'planner': 0}, speed=speed)
     faults = {j.bound.key: j.fault for j in judge(scenario_bounds(flight, summary), summary)}
     return dict(flat(summary)), faults
 
@@ -102,7 +103,27 @@ def test_the_bounds_are_those_of_band_and_limits():
     assert judged(synthetic(0.85))[1]['true_distance_m.min']
     assert judged(synthetic(3.0))[1]['true_distance_m.max']
     assert judged(synthetic(speed=0.6))[1]['speed_max_m_s']
-    assert 'not measured' in judged(synthetic(), {})[1]['cpu_cores.total']
+    for unknown in ({'cores': {}}, {'speed': None}):
+        assert 'not measured' in judged(synthetic(), **unknown)[1]['cpu_cores.at_reference']
+
+
+@pytest.mark.parametrize(('cores', 'speed', 'ok'), [
+    (1.4, 1.0, True), (1.6, 1.0, False), (1.6, 0.5, True), (3.1, 0.5, False), (1.4, 1.1, False)])
+def test_processor_time_is_judged_at_one_speed(cores, speed, ok):
+    """1.6 cores failed good flights on a machine of half the speed."""
+    figures, faults = judged(synthetic(), {'planner': cores}, speed)
+    assert figures['cpu_cores.total'] == cores and figures['cpu_speed'] == speed
+    assert bool(faults['cpu_cores.at_reference']) is not ok
+
+
+def test_the_yardstick_is_the_speed_without_programs_beside():
+    yardstick = Yardstick()
+    assert yardstick.speed is None
+    for now in (0.0, 0.5, 1.0):
+        yardstick.sample(now)
+    assert len(yardstick.times) == 2 and min(yardstick.times) > 0.0
+    yardstick.times = [2.0 * REFERENCE] * 5 + [9.0 * REFERENCE] * 5
+    assert yardstick.speed == pytest.approx(0.5)
 
 
 def test_commands_against_law_and_late_camera_fail_when_busy():

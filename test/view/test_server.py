@@ -23,6 +23,7 @@ import json
 import re
 import socket
 import threading
+import time
 from typing import Any
 
 import aiohttp
@@ -31,6 +32,7 @@ import pytest
 from flock_follower.view.access import Access
 from flock_follower.view.server import CONNECTIONS_MAX, FILES, PAGES_MAX, PageServer, STATIC
 
+DEADLINE = 40.0  # s for anything awaited
 TIMEOUT = aiohttp.ClientTimeout(total=20.0)
 
 
@@ -190,7 +192,8 @@ def test_a_page_gets_the_history_first_then_states(rig: Rig) -> None:
             rig.server.send_answer('brake', True, '<img onerror=1>' * 100)
             got: list[Any] = []
             while len(got) < 4 or b'jpeg' not in got:
-                got.append((await opened.receive()).data)
+                # A page that receives nothing more raises TimeoutError.
+                got.append((await opened.receive(timeout=DEADLINE)).data)
             assert not rig.server.greets
             return [one if one == b'jpeg' else json.loads(one) for one in got]
     history, *rest = rig.run(ask)
@@ -211,7 +214,9 @@ def test_page_that_does_not_read_delays_no_other(rig: Rig) -> None:
             writer.write((f'GET /ws HTTP/1.1\r\nHost: {rig.host}\r\nOrigin: {rig.origin}\r\n'
                           'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13'
                           '\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n').encode())
+            end = time.monotonic() + DEADLINE
             while rig.server.pages < 2:
+                assert time.monotonic() < end, 'the second page is not open'
                 await asyncio.sleep(0.01)
             await quick.receive()
             for number in range(100):  # 20 MB: more than any buffer on the way
