@@ -45,13 +45,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flock_desk.closed_loop.metrics import is_guarded
 from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import Edges, GuardParams, PlannerParams
 from flock_follower.planner.projection import Discs, nearest_in_order, optimum, Side
-from flock_follower.planner.step import Memory, step
+from flock_follower.planner.step import Inputs, Memory, step
 
 #: Numbers of neighbors: how many times the bare law a tick may take, by 99th percentiles.
 MOST_LAWS = {1: 8.0, 4: 12.0, 12: 15.0, 30: 18.0}
@@ -125,9 +126,9 @@ def ticks(count: int, flights: int) -> tuple[Array, Array, float]:
             seen = [Neighbor(
                 f'n{k}', own.stamp, positions[k] + POSITION_NOISE * rng.normal(size=3),
                 velocities[k] + VELOCITY_NOISE * rng.normal(size=3)) for k in range(count)]
-            inputs.append((memory, own.stamp + 0.02, True, own, seen, params))
+            inputs.append((memory, Inputs(own.stamp + 0.02, True, own, seen), params))
             memory, decision = step(*inputs[-1])
-            guarded += decision.is_guarded
+            guarded += is_guarded(decision)
             a = np.zeros(3) if decision.acceleration is None else decision.acceleration
             velocity = own.velocity + params.period * a
             own = OwnState(own.stamp + params.period, own.position + params.period * velocity,
@@ -137,9 +138,10 @@ def ticks(count: int, flights: int) -> tuple[Array, Array, float]:
     return tick, law, guarded / len(inputs)
 
 
-def bare_law(_memory: Memory, _now: float, _engaged: bool, own: OwnState, seen: list[Neighbor],
-             params: PlannerParams) -> Array:
+def bare_law(_memory: Memory, inputs: Inputs, params: PlannerParams) -> Array:
     """Return the command of the law alone, (3,), m/s^2, for the inputs of a step."""
+    own, seen = inputs.own, inputs.estimates
+    assert own is not None
     return acceleration(np.array([n.position for n in seen]) - own.position,
                         np.array([n.velocity for n in seen]) - own.velocity, params.law)
 

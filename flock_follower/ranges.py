@@ -141,7 +141,8 @@ class Checked:
 def suggestion(name: str, known: Collection[str], otherwise: str = 'it has') -> str:
     """Return the known name that is nearest to a wrong one as a question, else all of them."""
     near = difflib.get_close_matches(name, sorted(known), n=1)
-    return f'did you mean {near[0]}?' if near else f'{otherwise} {", ".join(sorted(known))}'
+    return f'did you mean {near[0]}?' if near else (
+        f'{otherwise} {", ".join(sorted(known)) or "none"}')
 
 
 def first_reason(*checks: tuple[object, str]) -> str:

@@ -28,7 +28,7 @@ import pytest
 from flock_desk import scenarios
 import flock_follower
 from flock_follower.mavlink.parameter_table import origin
-from flock_follower.ranges import Checked, parameter, Range
+from flock_follower.ranges import Checked, parameter, Range, suggestion
 
 SPEED = Range(0.05, 20.0, 'm/s')
 POSITIVE = Range(0.0, 2.0, 's', above=True)
@@ -110,6 +110,13 @@ def test_every_number_of_a_checked_dataclass_has_a_range() -> None:
                                      'tuple[float, float, float]')}
         assert numbers == {name for name, valid in each.valid().items()
                            if isinstance(valid, Range)}, each
+
+
+@pytest.mark.parametrize(('known', 'text'), [
+    (['v_max', 'a_max'], 'did you mean v_max?'), (['rate', 'loop'], 'it has loop, rate'),
+    ([], 'it has none')])
+def test_a_wrong_name_is_answered_by_the_nearest_else_all(known: list[str], text: str) -> None:
+    assert suggestion('vmax', known) == text
 
 
 @pytest.mark.parametrize(('place', 'message'), [

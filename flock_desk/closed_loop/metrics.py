@@ -38,9 +38,16 @@ from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.flock import places
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.geometry import Array
+from flock_follower.planner.bound_keeping import REASONS
 from flock_follower.planner.modes import State
+from flock_follower.planner.scene import Decision
 
 STATES = tuple(State)
+
+
+def is_guarded(decision: Decision) -> bool:
+    """Return whether the guard altered the command."""
+    return any(reason in decision.limits for reason in REASONS)
 
 
 @dataclass(frozen=True)
@@ -155,7 +162,7 @@ class FlightsLog:
             'command': np.array([np.full(3, np.nan) if d.acceleration is None else d.acceleration
                                  for d in decisions]),
             'state': np.array([STATES.index(d.state) for d in decisions]),
-            'guarded': np.array([d.is_guarded for d in decisions]),
+            'guarded': np.array([is_guarded(d) for d in decisions]),
             'seen': (lookout.seen & edges).any(axis=1),
             'in_sight': (lookout.in_sight & edges).any(axis=1),
             'obeying': np.array([f.obeying for f in followers]),

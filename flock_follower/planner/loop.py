@@ -33,7 +33,7 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import odometry_fault, State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldOfView, FieldsOfView
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.step import Decision, Inputs, step
 
 #: Largest standard deviation of a neighbor's yaw that is used, rad.
 MAX_YAW_STD = 0.5
@@ -226,9 +226,9 @@ class PlannerLoop:
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
         waiting = self.waiting_reason(bridge_age) if self.engaged else self._disengaged_by
-        self.memory, decision = step(self.memory, now, self.engaged, own, neighbors, params,
-                                     looked, waiting, self.view, self.ground,
-                                     [self.seconds(stamp) for stamp in self._frames])
+        self.memory, decision = step(self.memory, Inputs(
+            now, self.engaged, own, neighbors, looked, waiting, self.view, self.ground,
+            [self.seconds(stamp) for stamp in self._frames]), params)
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None  # it is of another frame
         if decision.acceleration is None or decision.yaw is None:

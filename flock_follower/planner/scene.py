@@ -30,7 +30,6 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
-from flock_follower.planner.bound_keeping import REASONS
 from flock_follower.planner.inputs import (
     find_newest,
     Neighbor,
@@ -82,11 +81,6 @@ class Decision(NamedTuple):
     """The commanded altitude, m; NaN without one."""
     edges: tuple[str, ...] = ()
     """The neighbors at the ends of its edges; others are only kept clear of."""
-
-    @property
-    def is_guarded(self) -> bool:
-        """Return whether the guard altered the command."""
-        return any(reason in self.limits for reason in REASONS)
 
 
 class Scene(NamedTuple):

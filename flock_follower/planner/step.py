@@ -26,8 +26,9 @@ The order of the bounds on a command is that of :mod:`flock_follower.planner.gua
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,31 +47,40 @@ from flock_follower.planner.sight import FieldsOfView, Occlusion, occlusion
 from flock_follower.planner.vertical_yaw import Altitude, face_yaw, search_yaw, turn_rate
 
 
-def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
-         estimates: Iterable[Neighbor], params: PlannerParams, looked: float | None = None,
-         waiting: str = '', view: FieldsOfView = (), ground: float | None = None,
-         frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
-    """
-    Return the memory for the next step, and the decision for the time ``now``, s.
+class Inputs(NamedTuple):
+    """The inputs of one step."""
 
-    :param now: a step back by more than 0.1 s forgets everything.
-    :param engaged: whether commands are requested; :param own: the newest odometry, or None.
-    :param estimates: of neighbors since the last step; the newest of each name counts.
-    :param looked: when the last image was processed, s; None if none was: that is no fault.
-    :param waiting: reason why it may not command, or why it was disengaged, or ''.
-    :param view: of the cameras; () if unknown; :param ground: height at arming, m, in odom.
-    :param frames: stamps of the newest processed images, s, in their order.
-    """
-    last = memory.now
-    memory, rejected = ingest(memory, now, own, estimates, params)
+    now: float
+    """s; a step back by more than 0.1 s forgets everything."""
+    engaged: bool
+    """Whether commands are requested."""
+    own: OwnState | None
+    """The newest odometry, or None."""
+    estimates: Sequence[Neighbor]
+    """Of neighbors since the last step; the newest of each name counts."""
+    looked: float | None = None
+    """Time at which the last image was processed, s; None if none was: that is no fault."""
+    waiting: str = ''
+    """Reason why it may not command, or why it was disengaged, or ''."""
+    view: FieldsOfView = ()
+    """Of the cameras; () if unknown."""
+    ground: float | None = None
+    """Height at arming, m, in odom."""
+    frames: Sequence[float] = ()
+    """Stamps of the newest processed images, s, in their order."""
+
+
+def step(memory: Memory, inputs: Inputs, params: PlannerParams) -> tuple[Memory, Decision]:
+    """Return the memory for the next step, and the decision for the time of the inputs."""
+    last, now = memory.now, inputs.now
+    memory, rejected = ingest(memory, now, inputs.own, inputs.estimates, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
-    if memory.own is not None and memory.own.relative and engaged and not (
-            waiting or memory.given_up):
+    if memory.own is not None and memory.own.relative and inputs.engaged and not (
+            inputs.waiting or memory.given_up):
         memory, decision = relative.step(memory, memory.own, now, params, elapsed)
         return memory, decision._replace(rejected=rejected)
-    blinded = blind(looked, now, params)
-    memory, state, reason, newest = _mode(
-        memory, now, engaged, params, blinded, waiting, view, frames)
+    blinded = blind(inputs.looked, now, params)
+    memory, state, reason, newest = _mode(memory, inputs, params, blinded)
     if state is State.IDLE:
         return memory.begun_afresh(), Decision(state, reason, rejected=rejected)
     if memory.own is None or memory.given_up or odometry_fault(memory.own, now, params):
@@ -81,11 +91,12 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     flown = memory.pending * (max(now - memory.own.stamp, 0.0) / params.response_time)
     memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
     neighbors = scene.neighbors
-    altitude, vertical = _altitude(memory, scene, ground, flown, params, elapsed)
+    altitude, vertical = _altitude(memory, scene, inputs.ground, flown, params, elapsed)
     velocity = me.velocity + flown + memory.pending
     fallback = fallback_retreat(memory, scene, params)
     unlimited, fading = nominal(memory, state, me, velocity, neighbors, params)
-    command = constrain(unlimited, vertical, altitude.climb, memory, scene, velocity, view, params)
+    command = constrain(
+        unlimited, vertical, altitude.climb, memory, scene, velocity, inputs.view, params)
     if me.stamp - memory.switched < relative.SETTLING_TIME:
         command = command._replace(
             acceleration=relative.without_step(command.acceleration, memory.command))
@@ -109,17 +120,17 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         tuple(sorted(neighbors.edges)))
 
 
-def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
-          blinded: str, waiting: str, view: FieldsOfView, frames: Sequence[float]
-          ) -> tuple[Memory, State, str, float | None]:
+def _mode(memory: Memory, inputs: Inputs, params: PlannerParams,
+          blinded: str) -> tuple[Memory, State, str, float | None]:
     """
     Return memory, state, the reason for the state, and the stamp of the newest estimate, s.
 
     That estimate is one to follow: one seen, else one received. The memory has given up if no
     neighbor was followed for too long; it then sends no commands.
     """
+    now = inputs.now
     fault = odometry_fault(memory.own, now, params)
-    occluded = None if fault else _judge_occlusion(memory, now, frames, view)
+    occluded = None if fault else _judge_occlusion(memory, inputs)
     follow = [n for n in memory.neighbors.values() if n.member.role != AVOID and (
         occluded is None or n.received or n.name != memory.faced)]
     seen, received = (max((n.stamp for n in follow if n.received is by_message), default=None)
@@ -129,24 +140,23 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     given_up = memory.given_up or (
         now - begun if unfollowed is None else unfollowed) > params.resume_timeout
     state, reason = next_state(
-        engaged, fault or odometry_delay(memory.own, now, params) or blinded,
-        None if seen is None else now - seen, unfollowed, params, waiting, given_up,
+        inputs.engaged, fault or odometry_delay(memory.own, now, params) or blinded,
+        None if seen is None else now - seen, unfollowed, params, inputs.waiting, given_up,
         None if received is None else now - received, occluded is not None)
     if state is not State.IDLE:
         memory = memory._replace(given_up=given_up, begun=begun, occlusion=occluded)
     return memory, state, reason, received if seen is None else seen
 
 
-def _judge_occlusion(memory: Memory, now: float, frames: Sequence[float],
-                     view: FieldsOfView) -> Occlusion | None:
+def _judge_occlusion(memory: Memory, inputs: Inputs) -> Occlusion | None:
     """Return the occlusion of the faced neighbor, or None."""
     if memory.own is None or memory.followed is None:
         return None
-    me = propagate(memory.own, now)
+    me = propagate(memory.own, inputs.now)
     n = memory.neighbors.get(memory.faced) or memory.flock.get(memory.faced)
     sent = np.zeros(3) if memory.command is None else memory.command
     forward = math.cos(me.yaw) * sent[0] + math.sin(me.yaw) * sent[1]
-    return occlusion(memory.occlusion, n, me, frames, view, float(forward))
+    return occlusion(memory.occlusion, n, me, inputs.frames, inputs.view, float(forward))
 
 
 def _altitude(memory: Memory, scene: Scene, ground: float | None, flown: Array,

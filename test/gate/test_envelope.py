@@ -152,6 +152,12 @@ def test_from_the_approach_speed_it_stops_before_the_bound(distance, deceleratio
     assert speed >= 0.0 and flown <= distance * (1.0 + 1e-9) + 1e-9
 
 
+@pytest.mark.parametrize('place', [
+    Location(), Location(None, 0.2), Location(math.nan, 0.0), Location(5.0, math.inf)])
+def test_an_unknown_height_bounds_no_vertical_acceleration(place):
+    assert vertical_range(GateLimits(), place, 0.1, 0.5, 2.5) == (-math.inf, math.inf)
+
+
 def test_the_bounds_are_those_of_the_approach_speeds():
     limits, place = GateLimits(), Location(1.0, -0.2, np.array([0.0, 40.0]))
     braking = 0.4 * limits.a_max

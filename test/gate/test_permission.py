@@ -157,6 +157,12 @@ def test_a_request_hides_no_possible_takeover_by_the_pilot():
     assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
 
 
+def test_a_second_end_of_a_flight_is_no_possible_takeover():
+    giving = after(ASKED, seen(OURS), ENDED, ('end', 'low battery'))
+    assert next_permission(giving, seen(PILOT, 20.0)).announcement() == (
+        'INACTIVE: given back (low battery)')
+
+
 @pytest.mark.parametrize(('events', 'flies'), [
     ((), False), ((ASKED,), False), ((ASKED, seen(HOLD)), False), ((ASKED, seen(DISARMED)), False),
     ((ASKED, seen(OURS, airborne=False)), False), ((ASKED, seen(OURS)), True),

@@ -31,11 +31,14 @@ from flock_follower.gate.velocity_check import (
     LATCH_TIME,
     ODOM,
     Path,
+    plausible_velocity,
     Source,
     SourceMotion,
     VelocityComparison,
     YAW_MEMORY,
 )
+from flock_follower.geometry import Array
+from flock_follower.messages import FASTEST_OWN
 
 LIMITS = GateLimits()
 SLOW = SourceMotion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
@@ -58,7 +61,19 @@ def test_what_is_not_three_finite_numbers_is_no_vector(value):
     assert SLOW._replace(velocity=value).fresh_velocity(LIMITS) is None
 
 
+@pytest.mark.parametrize(('speed', 'known'), [
+    (FASTEST_OWN, True), (math.nextafter(FASTEST_OWN, math.inf), False)])
+def test_a_velocity_is_plausible_up_to_the_fastest(speed: float, known: bool) -> None:
+    assert (plausible_velocity((0.0, -speed, 0.0)) is not None) == known
+
+
 # Two sources that may disagree.
+
+def test_velocities_are_compared_only_if_commands_rest_on_odometry() -> None:
+    np.testing.assert_allclose(by(ODOM).difference, [0.1, -0.2, 0.0])
+    assert by(AUTOPILOT).difference is None
+    assert by(ODOM, autopilot=ACROSS._replace(**LATE)).difference is None
+
 
 @pytest.mark.parametrize(('yaw', 'own', 'turned'), [
     (3.1, -3.1, 6.2 - 2 * math.pi), (0.5, 0.4, 0.1), (0.0, 0.4, -0.4), (0.0, -0.4, 0.4)])
@@ -124,7 +139,7 @@ def test_it_is_blind_sooner_with_an_untrusted_velocity(
 
 def compared(differences, rate=20.0):
     """Return the comparison after differences of a time each, and the time of the last."""
-    comparison, now = VelocityComparison(), 0.0
+    comparison, now = VelocityComparison(), 100.0
     for value in differences:
         now += 1.0 / rate
         comparison.take(np.array([value, 0.0, 0.0]), 0.25, True, now)
@@ -142,6 +157,11 @@ def test_velocities_disagree_by_mean_sooner_if_more(differences, disagree):
     for rate in (20.0, 50.0) if not disagree else (20.0,):
         comparison, now = compared(differences, rate)
         assert (comparison.disagreeing_for(now) >= 0.0) == disagree
+
+
+def test_the_first_difference_has_no_weight_the_next_have() -> None:
+    assert compared([0.7])[0].difference == 0.0
+    assert compared([0.7, 0.7])[0].difference == pytest.approx(0.7 * (1.0 - math.exp(-0.05 / 0.3)))
 
 
 @pytest.mark.parametrize(('samples', 'latched'), [(20, True), (4, False)])
@@ -192,6 +212,61 @@ def test_a_velocity_error_adds_up_over_the_window(axis, seconds, shown):
 def test_a_jump_that_the_velocity_does_not_match_is_taken_out():
     first, second = paths(8.0, lambda t: (1.5 * (t > 6.0), 0.0, 0.0), still, velocity=np.zeros(3))
     assert np.linalg.norm(difference(first, second, 0.0, 8.0)) < 1e-9
+
+
+def test_a_displacement_within_the_window_follows_a_curve() -> None:
+    def curve(t: float) -> Array:
+        return np.array([0.1 * t * t, math.sin(t), -0.2 * t])
+
+    path = paths(20.0, curve, still)[0]
+    start, end = path.span
+    assert start <= 20.0 - DISPLACEMENT_WINDOW <= start + 0.2 and 19.9 <= end <= 20.0
+    for first, last in ((15.0, 20.0), (16.03, 18.32), (17.5, 17.6), (start, end)):
+        last = min(last, end)
+        np.testing.assert_allclose(
+            path.displacement(first, last), curve(last) - curve(first), atol=0.005)
+
+
+@pytest.mark.parametrize(('change', 'largest'), [(0.0, 6.3), (-1.5, 9.3)])
+@pytest.mark.parametrize('off', [-0.01, 0.01])
+def test_motion_that_explains_a_step_in_a_gap_is_no_jump(
+        change: float, largest: float, off: float) -> None:
+    path, velocity = Path(), np.array([1.0, 0.0, 0.0])
+    after = velocity + np.array([0.0, change, 0.0])
+    path.take(np.zeros(3), velocity, 10.0)
+    path.take(2.0 * after + [0.0, 0.0, largest + off], after, 12.0)  # 0.3 + 2 (|change| + 3)
+    assert path.position is not None
+    assert path.position[2] == pytest.approx(0.0 if off > 0.0 else largest + off)
+
+
+def test_a_position_beyond_a_sane_one_changes_nothing() -> None:
+    source = Source()
+    for position, std, expected, kept in (
+            ((1.0, 2.0, 3.0), 0.5, (1.0, 2.0, 3.0), 0.5),
+            ((1.1e6, 2.0, 3.0), 0.7, (1.0, 2.0, 3.0), 0.5),
+            ((math.nan, 2.0, 3.0), 0.7, (1.0, 2.0, 3.0), 0.5),
+            ((1.0, 2.0, 3.1), math.nan, (1.0, 2.0, 3.1), 0.0)):
+        source.take_position(position, 1.0, std, 0.3)
+        assert source.position is not None
+        assert tuple(source.position) == expected and source.std == kept
+
+
+@pytest.mark.parametrize(('age', 'jumped'), [(0.2, True), (0.4, False)])
+def test_only_a_fresh_velocity_finds_a_jump(age: float, jumped: bool) -> None:
+    source, now = Source(), 10.0
+    source.take_velocity(np.zeros(3), now - age)
+    source.take_position((0.0, 0.0, 0.0), now - 0.1, 0.0, 0.3)
+    source.take_position((2.0, 0.0, 0.0), now, 0.0, 0.3)
+    assert source.path.position is not None
+    assert source.path.position[0] == (0.0 if jumped else 2.0)
+
+
+def test_ages_of_velocity_and_yaw_count_from_their_own_times() -> None:
+    source = Source()
+    source.take_velocity(np.ones(3), 3.0)
+    source.take_yaw(0.5, 2.0)
+    motion = source.motion(9.0)
+    assert (motion.velocity_age, motion.yaw_age, motion.yaw) == (6.0, 7.0, 0.5)
 
 
 def test_what_is_old_or_interrupted_is_not_compared():

@@ -57,6 +57,16 @@ def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():
     assert np.std(found[100:]) < 0.03 and heights.stepped == -math.inf
 
 
+@pytest.mark.parametrize(('seconds', 'before', 'error'), [(8.0, 1.0, 0.3), (2.0, 0.59, 0.0)])
+def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, error):
+    heights = HeightEstimator()
+    for k in range(round(seconds / PERIOD)):
+        heights.take(0.05 * k, None, k * PERIOD)  # climbs at 1 m/s
+    assert before - 0.1 < heights.climb_rate < before + 0.1
+    heights.take(seconds, 0.7, seconds)  # 0.3 m/s too slow
+    assert heights.climb_rate == pytest.approx(0.7 + error, abs=0.03)
+
+
 def climb(t):
     return min(max(0.5 * (t - 4.0), 0.0), 5.0)
 

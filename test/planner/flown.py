@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 import math
 from typing import Any
 
@@ -27,10 +28,20 @@ from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.scene import Decision
+from flock_follower.planner.step import Inputs
+from flock_follower.planner.step import step as step_with
 
 PARAMS = PlannerParams()
 STILL = (0.0, 0.0, 0.0)
+
+
+def step(memory: Memory, now: float, engaged: bool, me: OwnState | None,
+         estimates: Iterable[Neighbor], params: PlannerParams, looked: float | None = None,
+         waiting: str = '', **more: Any) -> tuple[Memory, Decision]:
+    """Take a step with these inputs."""
+    return step_with(memory, Inputs(
+        now, engaged, me, [*estimates], looked, waiting, **more), params)
 
 
 def own(stamp: float = 0.0, position: ArrayLike = (0.0, 0.0, 2.0), velocity: ArrayLike = STILL,

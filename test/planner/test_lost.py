@@ -20,7 +20,7 @@ from dataclasses import replace
 import math
 from typing import Any
 
-from flown import commanded, Follower, own, PARAMS, seen
+from flown import commanded, Follower, own, PARAMS, seen, step
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -41,7 +41,6 @@ from flock_follower.planner.retreat import (
     STOPPING_TIME,
 )
 from flock_follower.planner.scene import survey
-from flock_follower.planner.step import step
 
 AHEAD = np.array([2.0, 0.0, 0.0])
 

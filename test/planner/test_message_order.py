@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence, Set
 from itertools import permutations
 from typing import Any
 
-from flown import own, seen
+from flown import own, seen, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -32,7 +32,7 @@ from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import Member, PlannerParams, ROLES
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.scene import Decision
 
 TICKS = 14
 NAMES = 'abcde'

@@ -21,7 +21,7 @@ import math
 from typing import Any
 
 import flown
-from flown import commanded, STILL
+from flown import commanded, step, STILL
 from flown import seen as leader
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -43,7 +43,7 @@ from flock_follower.planner.params import (
     PlannerParams,
     ROLES,
 )
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.scene import Decision
 
 PARAMS = flown.PARAMS
 

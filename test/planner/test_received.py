@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import replace
 import math
 
-from flown import Follower, own, PARAMS, seen
+from flown import Follower, own, PARAMS, seen, step
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import Member, PlannerParams
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.scene import Decision
 
 
 def reported(stamp: float, x: float = 2.0, received: bool = True, name: str = 'leader',

@@ -17,6 +17,7 @@
 from dataclasses import replace
 import math
 
+from flown import step
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -33,7 +34,6 @@ from flock_follower.planner.relative import (
     limit_relative,
     STEP_MAX,
 )
-from flock_follower.planner.step import step
 
 PARAMS = PlannerParams()
 SURE = 1e-4 * np.eye(3)

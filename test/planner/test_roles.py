@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import flown
-from flown import commanded, own, STILL
+from flown import commanded, own, step, STILL
 import numpy as np
 from numpy.typing import ArrayLike
 import pytest
@@ -27,7 +27,7 @@ from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import EDGE_RETURN_SPEED, Member, PlannerParams
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.scene import Decision
 
 STRANGER = {'stranger': Member('avoid')}
 PARAMS = PlannerParams(vehicles=STRANGER)
