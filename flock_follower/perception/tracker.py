@@ -228,10 +228,9 @@ class Tracker:
         model.check_image(image.shape[1], image.shape[0])
         look.sighting.stage = 'track'
         for name in look.near:
-            checked = look.camera.unchecked[name] == 0
             self._measure(image, look, name, track(
                 image, model, self._targets[name], look.expected[name],
-                look.camera.measured.get(name), checked), checked)
+                look.camera.measured.get(name), look.camera.unchecked[name] == 0))
         for name, expected in self._candidates(look):
             found = track(image, model, self._targets[name], expected, None, True)
             if found is not None and not look.known(found, self._side[name]):
@@ -318,28 +317,25 @@ class Tracker:
         """Return the time of a neighbor's filter, s, of an exposure by the camera's clock, s."""
         return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
 
-    def _measure(self, image: GrayImage, look: Look, name: str, found: Measurement | None,
-                 checked: bool) -> None:
-        """
-        Take the measurement of a neighbor near its expected place, if it was found there.
-
-        :param checked: whether the mirrored attitude was fitted, or too many steps were needed.
-        """
+    def _measure(self, image: GrayImage, look: Look, name: str,
+                 found: Measurement | None) -> None:
+        """Take the measurement of a neighbor near its expected place, if it was found there."""
         if found is None:
             return
         if self._of_candidate(look, found):
             look.others.append(found)
             return
-        if not checked or found.spacing is not None:  # both would take too long for one image
+        unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
+        if unchecked[name] or found.spacing is not None:
+            # In an image that was checked for the mirrored attitude this would take too long.
             found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
-        unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
         if found.margin is not None:
             unchecked[name] = self._images_unchecked(found, look.expected[name])
         elif found.spacing is None and last is not None and last.spacing is not None:
             unchecked[name] = 0  # its edges decided until now
-        else:  # after a check that failed, one image has time for a confirmation
-            unchecked[name] = int(checked) or unchecked[name] - 1
+        else:  # after a check without a result, one image has time for a confirmation
+            unchecked[name] = unchecked[name] - 1 if unchecked[name] else 1
 
     def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
         """Return the number of images until the mirrored attitude is checked again."""
