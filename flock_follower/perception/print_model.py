@@ -223,7 +223,8 @@ def _compare_in_uneven_light(brightness: Array, code: CellCode,
     """
     Return whether the image shows the marker's code in uneven light, and the excess of errors.
 
-    The excess is the number of wrong cells over the number from which on there are too many.
+    The excess is the number of wrong cells over the number from which on there are too many if
+    none is hidden.
     ``brightness`` (n, c): gray levels at n sample points in each of c cells.
     """
     colors = read(brightness, code.windows).mean(axis=0)
@@ -241,9 +242,9 @@ def _compare_in_uneven_light(brightness: Array, code: CellCode,
     bits = np.where(hidden, 0.0, colors[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
     wrong = _wrong((bits * code.bits)[~hidden])
-    too_many = 0.5 if count and not tracked else max(0.5 * code.errors, 1.0)
+    too_many = max(0.5 * code.errors, 1.0)
     # Codewords differ by more than twice the errors: hidden cells leave a difference.
-    return (wrong < too_many
+    return (wrong < (0.5 if count and not tracked else too_many)
             and count <= most * len(hidden) and (tracked or count <= 2 * code.errors)
             and _is_word(bits, code)
             and np.count_nonzero(colors[border] < 0.0) >= _MIN_BORDER * code.border

@@ -326,16 +326,15 @@ class Tracker:
             look.others.append(found)
             return
         unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
-        if unchecked[name] or found.spacing is not None:
-            # In an image that was checked for the mirrored attitude this would take too long.
-            found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
+        found = look.confirmed(image, found, self._targets[name], self.config.dictionary,
+                               not unchecked[name])
         look.measured[name] = found
         if found.margin is not None:
             unchecked[name] = self._images_unchecked(found, look.expected[name])
         elif found.spacing is None and last is not None and last.spacing is not None:
             unchecked[name] = 0  # its edges decided until now
-        else:  # after a check without a result, one image has time for a confirmation
-            unchecked[name] = unchecked[name] - 1 if unchecked[name] else 1
+        elif unchecked[name]:
+            unchecked[name] -= 1
 
     def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
         """Return the number of images until the mirrored attitude is checked again."""
