@@ -29,7 +29,6 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
-import cv2
 from detectors import ARUCO, detectors, Look
 import numpy as np
 from poses import errors_of, pose_at, truth_of
@@ -40,6 +39,7 @@ from flock_follower.files import resource
 from flock_follower.geometry import Array, Transform
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.perception import markers
+from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.perception.parameter_table import HAND_ACCELERATION, HAND_ANGULAR_NOISE
 from flock_follower.perception.pending_images import Perceiver
@@ -113,7 +113,7 @@ def main() -> int:
     parser.add_argument('--dictionary', default=ARUCO)
     parser.add_argument('--images', type=int, default=0, help='of each (default: all)')
     options = parser.parse_args()
-    cv2.setNumThreads(1)
+    compute_in_one_thread()
     for bag in options.bags:
         for name, figures in judge(bag, options.dictionary, options.images).items():
             print(f'{bag.name}, {name}: ' + ', '.join(

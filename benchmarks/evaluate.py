@@ -33,14 +33,12 @@ import sys
 import tempfile
 import time
 
-import cv2
-
 from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.files import resource
 from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import read_parameters
-from flock_follower.perception.images import decode_image
+from flock_follower.perception.images import compute_in_one_thread, decode_image
 
 #: The aim is 3: perception, planner, gate and images alone take 2.4 of it.
 MOST = 4.5
@@ -73,7 +71,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     if options.turns < 1:
         parser.error(f'--turns = {options.turns}: must be at least 1')
-    cv2.setNumThreads(1)
+    compute_in_one_thread()
     values = read_parameters(resource('config/follower.yaml'), TABLE)
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / 'result.mcap'

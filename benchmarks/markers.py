@@ -29,7 +29,6 @@ from itertools import pairwise
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import yaml
 
@@ -53,6 +52,7 @@ from flock_follower.geometry import (
 from flock_follower.neighbors_file import Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.markers import draw_marker, marker_cells, parse
 from flock_follower.perception.tracker import Tracker
 
@@ -167,7 +167,7 @@ def rms(values: list[float]) -> float:
 def main() -> None:
     """Print the detections."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
-    cv2.setNumThreads(1)
+    compute_in_one_thread()
     one, two = layout(DICTIONARY, [0], [0.16]), layout(DICTIONARY, [0, 1], SIZES)
     carried = {'0.16 m': parse(yaml.safe_load(neighbors_file(DICTIONARY, [one]))),
                'panel': parse(yaml.safe_load(neighbors_file(DICTIONARY, [two])))}

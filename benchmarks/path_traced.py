@@ -40,9 +40,10 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from perception import BAGS, Flight, WRONG
+
+from flock_follower.perception.images import compute_in_one_thread
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'rendered'
 ROWS = ('room_hover', 'room_hover/jitter', 'room_hover/finger', 'room_hover/flare',
@@ -98,7 +99,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if find_spec('scipy') is None:
         print('error: the tool of the path-traced flights needs scipy', file=sys.stderr)
         return 1
-    cv2.setNumThreads(1)
+    compute_in_one_thread()
     print('                     default  in means of default: ours     aruco2   first'
           '               NEES                   3 sigma   RMS\n'
           '                          ms           mean   p99   mean   p99       s'

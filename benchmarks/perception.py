@@ -81,7 +81,7 @@ from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.buffer import OdometryBuffer
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import compute_in_one_thread, GrayImage
 from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
@@ -165,7 +165,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     if options.frames < 0:
         parser.error(f'--frames = {options.frames}: must be at least 0')
-    cv2.setNumThreads(1)
+    compute_in_one_thread()
     print(f'OpenCV {cv2.__version__}, numpy {np.__version__}, one thread, CPU time')
     figures: dict[str, dict[str, dict[str, float]]] = {}
     missed: list[str] = []

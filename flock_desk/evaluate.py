@@ -44,8 +44,6 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-import cv2
-
 from flock_desk.runs.console import explained, guarded
 from flock_desk.runs.evaluation import evaluate
 from flock_desk.runs.judge import check_names, Judgment, load_bounds
@@ -57,6 +55,7 @@ from flock_follower.checks.findings import ERROR, Finding, ready, WARNING
 from flock_follower.files import resource
 from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import parameters_flown, read_parameters
+from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.topic_names import parse_remaps
 
 
@@ -117,7 +116,7 @@ def _evaluate_all(bags: Mapping[str, Path], options: argparse.Namespace) -> int:
 
 
 def _run(task: partial[BagOutcome]) -> BagOutcome:
-    cv2.setNumThreads(1)  # the cost measured is that of one core
+    compute_in_one_thread()  # the cost measured is that of one core
     try:
         return task()
     except (OSError, ValueError) as error:

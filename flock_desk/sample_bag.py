@@ -50,6 +50,7 @@ from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import odometry as odometry_message
 from flock_follower.parameters.files import FLOWN
+from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.ranges import Range
 
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
@@ -242,7 +243,7 @@ _recording = lru_cache(maxsize=1)(Recording)  # one in each process that renders
 
 
 def _render_images(variant: Variant, seed: int, k: int) -> BagMessage:
-    cv2.setNumThreads(1)
+    compute_in_one_thread()
     return _recording(variant, seed).image(k)
 
 

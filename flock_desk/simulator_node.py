@@ -36,7 +36,6 @@ import os
 import sys
 import time
 
-import cv2
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo
@@ -70,6 +69,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import Spec
+from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
@@ -379,7 +379,7 @@ def _logged(state: Odometry) -> tuple[Array, Array, Array]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the scenario, 1 or 3 if it cannot be flown."""
-    cv2.setNumThreads(1)  # OpenCV's threads take twice the time, waiting
+    compute_in_one_thread()  # OpenCV's threads take twice the time, waiting
     return run(Simulator, args, Simulator.fly)
 
 

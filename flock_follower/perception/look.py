@@ -263,11 +263,17 @@ class Look:
         return [name for name in self.anywhere if name not in self.measured]
 
     def confirmed(self, image: GrayImage, found: Measurement, sought: Target,
-                  dictionary: str) -> Measurement:
-        """Return a measurement of a neighbor, or the fault of its detected marker."""
+                  dictionary: str, can_wait: bool) -> Measurement:
+        """
+        Return a measurement of a neighbor, or the fault of its detected marker.
+
+        :param can_wait: whether the image was also to be checked for the mirrored attitude: with a
+            confirmation it would take too long.
+        """
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
-            if self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD:
+            if found.margin is not None or self.stamp - confirmed_at.get(name, -math.inf) <= (
+                    (1 + can_wait) * CONFIRM_PERIOD):
                 return found
             place = found.T_camera_body
             ids, corners = search.near(

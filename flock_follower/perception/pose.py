@@ -403,8 +403,6 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
 def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
     lines, codes = found.lines, found.lines.model.codes
-    if len(codes) == 1:
-        return np.array([shows_code(image, lines.cells, codes[0], tracked)])
     return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code, tracked)
                      for k, code in enumerate(codes)])
 

@@ -45,6 +45,8 @@ from flock_follower.perception.markers import (
 
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
 SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
+#: The cells of a window, (k,), times this: for each the sum over the others.
+_OTHERS = 1.0 - np.eye(max(columns * rows for columns, rows in SHAPES))
 _MIN_APART = 4.0  # gray levels between black and white, both in the shade
 #: Black or white cells are not used if their variance exceeds this share of the squared half of
 #: their contrast.
@@ -97,13 +99,12 @@ def read(brightness: Array, seen: Windows) -> Array:
     -1: as the black cells around, 1: as the white cells around, 0: no cells for a comparison.
     """
     values = brightness.astype(float)[:, seen.cells]
-    sums = []
     # A cell is not compared with itself, and with no saturated cell that should be black.
-    for color in (seen.white, seen.black * (values < _SATURATED_LEVEL)):
-        some = values * color
-        sums.append([total.sum(axis=-1, keepdims=True) - total
-                     for total in (color, some, some * values)])
-    (whites, white, white2), (blacks, black, black2) = sums
+    light, black = values * seen.white, seen.black * (values < _SATURATED_LEVEL)
+    some = np.stack([light, values * light, black, dark := values * black, values * dark])
+    white, white2, blacks, black, black2 = some.reshape(-1, len(_OTHERS)).dot(_OTHERS).reshape(
+        some.shape)
+    whites = seen.white.dot(_OTHERS)
     light, dark = white / whites, black / np.maximum(blacks, 1.0)
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
     spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
@@ -115,14 +116,15 @@ def read(brightness: Array, seen: Windows) -> Array:
         np.where(readable, odd, np.inf), np.where(readable, shown, 0.0)))
     best = odd[:, seen.places].argmin(axis=2)
     chosen = seen.places[np.arange(seen.places.shape[0]), best]
-    colors: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
-    return colors
+    return np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
 
 
 _MIN_CONTRAST = 10.0  # gray levels between the black border and the quiet zone
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Further places at which a cell is read, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
+#: Excess of errors in the middles of the cells from which on no other places are read.
+_MAX_EXCESS = 2.0
 _MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
 _MOST_HIDDEN_TRACKED = 0.4  # share of the inner cells of a tracked marker that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
@@ -193,12 +195,13 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = 
             and _few_wrong(cells * code.bits, brightness, code, tracked)
             and _is_word(cells, code)):
         return True
-    if _shows_in_uneven_light(brightness[None], code, tracked):
-        return True
+    shown, excess = _compare_in_uneven_light(brightness[None], code, tracked)
+    if shown or excess >= _MAX_EXCESS:
+        return shown
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
     beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
-    return _shows_in_uneven_light(gray_levels(image, beside).reshape(len(_BESIDE), -1), code,
-                                  tracked)
+    return _compare_in_uneven_light(gray_levels(image, beside).reshape(len(_BESIDE), -1), code,
+                                    tracked)[0]
 
 
 def _few_wrong(agreeing: Array, brightness: Array, code: CellCode, tracked: bool) -> bool:
@@ -216,10 +219,13 @@ def _wrong(agreeing: Array) -> float:
     return float(np.clip(0.5 - agreeing, 0.0, 1.0).sum())
 
 
-def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> bool:
+def _compare_in_uneven_light(brightness: Array, code: CellCode,
+                             tracked: bool) -> tuple[bool, float]:
     """
-    Return whether the image shows the marker's code in uneven light.
+    Return whether the image shows the marker's code in uneven light, and the excess of errors.
 
+    The excess is the number of wrong cells over the number from which on there are too many if
+    none is hidden.
     ``brightness`` (n, c): gray levels at n sample points in each of c cells.
     """
     colors = read(brightness, code.windows).mean(axis=0)
@@ -237,12 +243,14 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> 
     bits = np.where(hidden, 0.0, colors[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
     wrong = _wrong((bits * code.bits)[~hidden])
+    too_many = max(0.5 * code.errors, 1.0)
     # Codewords differ by more than twice the errors: hidden cells leave a difference.
-    return (wrong < (0.5 if count and not tracked else max(0.5 * code.errors, 1.0))
+    return (wrong < (0.5 if count and not tracked else too_many)
             and count <= most * len(hidden) and (tracked or count <= 2 * code.errors)
             and _is_word(bits, code)
             and np.count_nonzero(colors[border] < 0.0) >= _MIN_BORDER * code.border
-            and np.count_nonzero(colors[around] > 0.0) >= _MIN_AROUND * len(colors[around]))
+            and np.count_nonzero(colors[around] > 0.0) >= _MIN_AROUND * len(colors[around])
+            ), wrong / too_many
 
 
 def _is_word(read: Array, code: CellCode) -> bool:

@@ -276,19 +276,17 @@ def _squares(outlines: list[Array], max_hidden: Array) -> Array:
         hidden = np.where(hidden < max_hidden[index, None], hidden, np.inf)
         least = np.where(hidden == hidden.min(axis=1, keepdims=True),
                          fewer[:, :, 0].dot((1.0, 1e-6)), np.inf).argmin(axis=1)
-        rows = np.arange(len(index))
-        removed = hidden[rows, least] < (
+        removed = hidden.min(axis=1) < (
             np.inf if count > 5 else _BLUNT_SHARE * max_hidden[index])
         if count == 5:
             row, side = ((hidden < np.inf) & ~removed[:, None]).nonzero()
             several.append((index[row], fewer[row, side]))
-        index, corners = index[removed], fewer[rows, least][removed]
+        index, corners = index[removed], fewer[removed, least[removed]]
     whole = (counts == 4).nonzero()[0]
     several += [(index, corners), (whole, np.reshape(
         [outlines[k] for k in whole.tolist()], (-1, 4, 2)))]
     order = np.argsort(np.concatenate([each for each, _ in several]), kind='stable')
-    squares: Array = np.concatenate([each for _, each in several])[order]
-    return squares
+    return np.concatenate([each for _, each in several])[order]
 
 
 def _without_sides(corners: Array) -> tuple[Array, Array]:
@@ -296,15 +294,14 @@ def _without_sides(corners: Array) -> tuple[Array, Array]:
     Return convex outlines (n, c, 2) with each side removed, (n, c, c - 1, 2), and what it hid.
 
     The sides before and after are prolonged until they meet. What is hidden, (n, c), px^2, is
-    infinite if they do not meet.
+    NaN if they do not meet.
     """
     count = corners.shape[1]
     a, b, c, d = (np.roll(corners, -k, axis=1) for k in range(4))
     (ax, ay), (bx, by), (cx, cy) = (np.moveaxis(leg, 2, 0) for leg in (b - a, c - b, d - c))
     across = ax * cy - ay * cx
-    meet = across > 1e-9
-    further = (bx * cy - by * cx) / np.where(meet, across, 1.0)
-    hidden = np.where(meet, 0.5 * further * (ax * by - ay * bx), np.inf)
+    further = (bx * cy - by * cx) / np.where(across > 1e-9, across, np.nan)
+    hidden = 0.5 * further * (ax * by - ay * bx)
     met = b + further[:, :, None] * (b - a)
     others = (np.arange(count)[:, None] + np.arange(3, count + 1)) % count
     return np.concatenate([met[:, :, None], corners[:, others]], axis=2), hidden

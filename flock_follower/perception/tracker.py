@@ -229,10 +229,9 @@ class Tracker:
         model.check_image(image.shape[1], image.shape[0])
         look.sighting.stage = 'track'
         for name in look.near:
-            checked = look.camera.unchecked[name] == 0
             self._measure(image, look, name, track(
                 image, model, self._targets[name], look.expected[name],
-                look.camera.measured.get(name), checked), checked)
+                look.camera.measured.get(name), look.camera.unchecked[name] == 0))
         for name, expected in self._candidates(look):
             found = track(image, model, self._targets[name], expected, None, True)
             if found is not None and not look.known(found, self._side[name]):
@@ -319,28 +318,24 @@ class Tracker:
         """Return the time of a neighbor's filter, s, of an exposure by the camera's clock, s."""
         return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
 
-    def _measure(self, image: GrayImage, look: Look, name: str, found: Measurement | None,
-                 checked: bool) -> None:
-        """
-        Take the measurement of a neighbor near its expected place, if it was found there.
-
-        :param checked: whether the mirrored attitude was fitted, or too many steps were needed.
-        """
+    def _measure(self, image: GrayImage, look: Look, name: str,
+                 found: Measurement | None) -> None:
+        """Take the measurement of a neighbor near its expected place, if it was found there."""
         if found is None:
             return
         if self._of_candidate(look, found):
             look.others.append(found)
             return
-        if not checked or found.spacing is not None:  # both would take too long for one image
-            found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
-        look.measured[name] = found
         unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
+        found = look.confirmed(image, found, self._targets[name], self.config.dictionary,
+                               not unchecked[name])
+        look.measured[name] = found
         if found.margin is not None:
             unchecked[name] = self._images_unchecked(found, look.expected[name])
         elif found.spacing is None and last is not None and last.spacing is not None:
             unchecked[name] = 0  # its edges decided until now
-        else:  # after a check that failed, one image has time for a confirmation
-            unchecked[name] = int(checked) or unchecked[name] - 1
+        elif unchecked[name]:
+            unchecked[name] -= 1
 
     def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
         """Return the number of images until the mirrored attitude is checked again."""

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from array import array
+import time
 import tracemalloc
 
 import cv2
@@ -25,7 +26,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.perception.images import decode, decode_compressed
+from flock_follower.perception.images import compute_in_one_thread, decode, decode_compressed
 
 GRAY = np.random.default_rng(5).integers(0, 256, (12, 10), dtype=np.uint8)
 COLORS = {'red': (255, 0, 0), 'green': (0, 255, 0), 'blue': (0, 0, 255)}
@@ -191,3 +192,13 @@ def test_hot_pixels_do_not_darken_a_twelve_bit_image() -> None:
     gray = decode('mono16', 60, 80, 160, False, pixels.tobytes())
     assert gray[30, 40] == 250
     assert gray[3, 4] == 255
+
+
+def test_large_products_use_one_thread() -> None:
+    compute_in_one_thread()
+    matrix = np.ones((400, 400))
+    whole, own = time.process_time(), time.thread_time()
+    for _ in range(20):
+        matrix.dot(matrix)
+    own = time.thread_time() - own
+    assert time.process_time() - whole < 1.2 * own
