@@ -122,11 +122,9 @@ class FrameErrors:
                 *estimate.covariance[:6, :6].ravel().tolist()))
 
     def _take(self, states: array[float], state: OdometryState) -> None:
-        """Keep states in the order of their stamps: a late one is dropped."""
-        time = state.stamp - self._start
-        if not states or time > states[-_STATE_LENGTH]:
-            states.extend((time, *state.position.tolist(), *state.quaternion.tolist(),
-                           *state.velocity.tolist(), *state.angular_velocity.tolist()))
+        states.extend((state.stamp - self._start, *state.position.tolist(),
+                       *state.quaternion.tolist(), *state.velocity.tolist(),
+                       *state.angular_velocity.tolist()))
 
     def table(self, name: str) -> dict[str, Array]:
         """
@@ -206,7 +204,9 @@ def _interpolate(states: array[float], stamps: Array) -> _States:
     rows = np.array(states).reshape(-1, _STATE_LENGTH)
     if not len(rows):
         return result
-    times = rows[:, 0]
+    # By their stamps, of equal ones the first: a stamp far ahead must not hide the later ones.
+    times, first = np.unique(rows[:, 0], return_index=True)
+    rows = rows[first]
     after = np.minimum(np.searchsorted(times, stamps), len(rows) - 1)
     before = np.where(times[after] == stamps, after, np.maximum(after - 1, 0))
     known = ((times[before] <= stamps) & (stamps <= times[after])

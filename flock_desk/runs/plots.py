@@ -183,7 +183,8 @@ def draw_above(axis: Axes, flight: Flight) -> None:
         known = path[np.isfinite(path).all(axis=1)]
         for end, marker in zip((known[:1], known[-1:]), 'os'):
             axis.plot(*end.T, marker, color=color, markersize=6)
-    for k in np.searchsorted(times, np.arange(0.0, times[-1], period)):
+    # Of another clock, the stamps may be years after the bag's end.
+    for k in np.searchsorted(times, np.arange(0.0, min(times[-1], flight.duration), period)):
         pair = np.transpose([path[k] for path in paths])
         axis.plot(*pair, color=LIMIT, linewidth=0.6, alpha=0.5)
     low, high = np.transpose([axis.get_xlim(), axis.get_ylim()])

@@ -88,6 +88,16 @@ def collected(frames: int = 10, *, drift: float = 0.0, turned: float = 0.0, nois
     return errors.table('leader')
 
 
+def test_one_stamp_far_ahead_hides_no_later_state() -> None:
+    errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
+    errors.odometry(state(3600 * SECOND, np.zeros(3)))
+    for k in range(10):
+        errors.odometry(state(k * SECOND // 20, VELOCITY * k / 20))
+        errors.frame(START + k * SECOND // 20, {}, {})
+    np.testing.assert_allclose(
+        errors.table('leader')['own'], np.arange(10)[:, None] * VELOCITY / 20, atol=1e-6)
+
+
 def test_drift_common_to_both_is_no_error() -> None:
     table = collected(drift=0.4)
     for name in ('position', 'velocity'):

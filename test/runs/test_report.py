@@ -20,13 +20,17 @@ from __future__ import annotations
 import math
 from pathlib import Path
 import re
+from types import SimpleNamespace
 from typing import Any
 
+from matplotlib.figure import Figure
+import numpy as np
 import pytest
 
 from flock_desk.runs.console import guarded, logs_in, progress
 from flock_desk.runs.figure_table import bounds, FIGURES, parts_of, words
 from flock_desk.runs.judge import check_names, FigureBound, judge, load_bounds, parse_bounds
+from flock_desk.runs.plots import draw_above, MAX_PAIRS
 from flock_desk.runs.processes import TooBusyError
 from flock_desk.runs.report import announce, LINE_WIDTH, report, table, text, write_report
 from flock_follower.checks.processor import Load
@@ -203,3 +207,11 @@ def test_logs_are_named_only_if_there_are_some(tmp_path: Path) -> None:
     assert logs_in(tmp_path) == logs_in(tmp_path / 'none') == ''
     (tmp_path / 'bridge.log').touch()
     assert str(tmp_path) in logs_in(tmp_path)
+
+
+def test_stamps_of_another_clock_cost_no_lines_in_a_map() -> None:
+    axis = Figure().subplots()
+    draw_above(axis, SimpleNamespace(  # type: ignore[arg-type]
+        table={'time': np.array([0.0, 1.0, 20_000.0])}, duration=12.0,
+        paths={name: np.zeros((3, 3)) for name in ('leader', 'follower')}))
+    assert len(axis.lines) <= MAX_PAIRS + 6
