@@ -50,7 +50,7 @@ SMOOTHING_GAP = 1.0  # s without an estimate after which the smoothing begins an
 
 
 class Motion(NamedTuple):
-    """A neighbor's acceleration (3,), m/s^2, smoothed, and its velocity (3,), m/s, at a stamp."""
+    """A neighbor's smoothed acceleration (3,), m/s^2, and its velocity (3,), m/s, at a stamp."""
 
     stamp: float
     velocity: list[float]
@@ -60,9 +60,9 @@ class Motion(NamedTuple):
 def update_motions(motions: Mapping[str, Motion],
                    neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
     """
-    Return the motions of the neighbors, brought up to their newest estimates.
+    Return the motions of the neighbors, updated with their newest estimates.
 
-    The acceleration is that of the estimate, or the change of its velocity if it has none.
+    The acceleration is that of the estimate; if the estimate has none, the change of velocity.
     """
     updated = {}
     for n in neighbors:
@@ -116,7 +116,7 @@ NONE: Mapping[str, Any] = {}  # never changed
 
 
 class Memory(NamedTuple):
-    """The state that one step hands to the next; ``Memory()`` is the start."""
+    """The state that one step passes to the next step; ``Memory()`` is the initial state."""
 
     now: float | None = None
     own: OwnState | None = None
@@ -193,7 +193,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     """
     Return the memory with the valid new inputs, without old inputs, and the rejections.
 
-    The order of the estimates has no influence: all later steps use the order of names.
+    The order of the estimates has no influence, because all later steps sort by name.
     """
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
@@ -271,7 +271,7 @@ Known = TypeVar('Known')
 
 
 def by_name(known: dict[str, Known]) -> dict[str, Known]:
-    """Return a mapping in the order of its names: sums and ties then do not depend on history."""
+    """Return a mapping sorted by name, so that sums and ties do not depend on the history."""
     return dict(sorted(known.items())) if len(known) > 1 else known
 
 

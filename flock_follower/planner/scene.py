@@ -15,7 +15,7 @@
 """
 The scene of one step, and the decision that the step makes.
 
-The scene is the ego state, the neighbors at hand, and those lost that may still be near.
+The scene is the ego state, the present neighbors, and lost neighbors that may still be near.
 
 ``survey`` also updates the memory: the neighbors to keep clear of, their motions, and the loss of
 sight of the neighbor that the vehicle followed.
@@ -157,13 +157,13 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
 
 
 def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
-    """Return whether a received follower has fallen silent: it may have failed."""
+    """Return whether a received follower has become silent, so that it may have failed."""
     return (n.received and n.member.role == FOLLOWER
             and now - n.stamp > params.heard_timeout)
 
 
 def expected_now(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
-    """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
+    """Return a lost neighbor at its expected place, predicted by at most ``coast_timeout``."""
     age = min(now - n.stamp, params.coast_timeout)
     it = predict(n, memory.acceleration(n), age, params)
     return n._replace(stamp=n.stamp + age, position=np.array(it.position),

@@ -15,10 +15,10 @@
 """
 One step of the planner: from the newest estimates to one safe acceleration.
 
-The states are those of :mod:`flock_follower.planner.modes`. Leaving IDLE begins a new flight with
-the present altitude and yaw: nothing of an earlier flight remains. When following begins, begins
-again, or continues with other parameters, the command of the law is faded in; the guard acts on
-the result at once. Nothing here reads a clock: equal inputs give equal outputs.
+The states are those of :mod:`flock_follower.planner.modes`. When the state leaves IDLE, a new
+flight begins with the present altitude and yaw, without data of an earlier flight. When following
+begins, begins again, or continues with changed parameters, the law's command is faded in; the
+guard acts at once. No function reads a clock: equal inputs give equal outputs.
 
 The order of the bounds on a command is that of :mod:`flock_follower.planner.guard`, within
 ``a_max`` and ``v_max``. Altitude has priority over all horizontal motion.
@@ -56,8 +56,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param now: a step back by more than 0.1 s forgets everything.
     :param engaged: whether commands are requested; :param own: the newest odometry, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
-    :param looked: when the last image was processed, s; None if none was: that is no fault.
-    :param waiting: reason why it may not command, or why it was disengaged, or ''.
+    :param looked: time of the last processed image, s; None before the first, which is no fault.
+    :param waiting: reason why the planner may not command, or why it was disengaged, or ''.
     :param view: of the cameras; () if unknown; :param ground: height at arming, m, in odom.
     :param frames: stamps of the newest processed images, s, in their order.
     """
