@@ -52,7 +52,7 @@ class Camera(NamedTuple):
     """The camera and the marker; None: unknown."""
 
     rate: float | None = None
-    """Of the processed images, Hz."""
+    """Rate of the processed images, Hz."""
     marker: float | None = None
     """Width of the marker at a distance of 1 m, px."""
     half_height: float | None = None
@@ -66,7 +66,7 @@ class Judgment(NamedTuple):
     parameter: str
     value: float
     valid: str
-    """The nearest value that flies: 'at least 2.4 m/s^2'."""
+    """The nearest accepted value, such as 'at least 2.4 m/s^2'."""
     why: str
 
     def __str__(self) -> str:

@@ -178,7 +178,7 @@ class Observations:
 
     live: bool = True
     source: str = ''
-    """The bag."""
+    """Path of the bag."""
     duration: float = 0.0
     namespace: str = ''
     names: dict[str, str] = field(default_factory=dict)
@@ -187,7 +187,7 @@ class Observations:
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     own: OwnMotion | None = None
     child_frame: str = ''
-    """Of the newest ``odom``."""
+    """The child frame of the newest ``odom``."""
     static_child: Transform | None = None
     """Pose of this frame on base_link by tf_static."""
     calibration: Any = None
@@ -197,7 +197,7 @@ class Observations:
     sources: dict[str, SourceSeen] = field(default_factory=dict)
     """The poses by another detector, by neighbor."""
     frames_topic: str = ''
-    """Of the images that the other detector processes; '' if the neighbors' file names none."""
+    """Topic of the images that another detector processes; '' without such a topic."""
     static: StaticFrames = field(default_factory=StaticFrames)
     """The frames of tf_static."""
     pictures: list[Picture] = field(default_factory=list)
@@ -206,7 +206,7 @@ class Observations:
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
     """Newest status by the full name of the node, without its first slash."""
     files: dict[str, list[str]] = field(default_factory=dict)
-    """The parameter files by the name of the node, as for ``statuses``; two of two nodes."""
+    """The parameter files by the name of the node, as for ``statuses``."""
     machine: Machine = field(default_factory=Machine)
     incomplete: str = ''
     """Why a bag was never finished."""
@@ -214,7 +214,7 @@ class Observations:
     """Steps in the times of a bag: s after its start, s of the step, whether it interrupts images
     or odometry."""
     set_back: float = 0.0
-    """By how much the clock was set back while a bag was recorded, s: its messages are mixed."""
+    """By how much the clock was set back during the recording of a bag, s."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
 

@@ -51,7 +51,7 @@ class Bound(NamedTuple):
     """A bound on the acceleration a (3,), m/s^2: normal . a >= least."""
 
     normal: Sequence[float]
-    """(3,); it need not be of unit length."""
+    """Normal (3,), of any length."""
     least: float
     reason: str
     distance: float = 0.0

@@ -53,7 +53,7 @@ class OwnState(NamedTuple):
     ages: tuple[float, ...] = ()
     """Ages, s, of earlier messages when the next message replaced them; () if unknown."""
     relative: bool = False
-    """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
+    """Whether this is the motion without odometry, in the frame ``messages.RELATIVE``."""
 
 
 UNKNOWN: Array = np.zeros((3, 3))
@@ -76,9 +76,9 @@ class Neighbor(NamedTuple):
     acceleration: Array | None = None
     yaw: float | None = None
     received: bool = False
-    """Whether another vehicle reported it; else a camera of this vehicle sees it."""
+    """Whether another vehicle reported the neighbor; if not, an ego camera sees it."""
     member: Member = SEEN_DEFAULT
-    """Role and size of the neighbor, from its file."""
+    """Role and size of the neighbor, from the neighbors' file."""
 
 
 Moving = TypeVar('Moving', OwnState, Neighbor)
@@ -174,17 +174,17 @@ class Prediction(NamedTuple):
     """
 
     position: list[float]
-    """(3,), m, now."""
+    """Position (3,), m, now."""
     velocity: list[float]
-    """(3,), m/s."""
+    """Velocity (3,), m/s."""
     acceleration: list[float]
     """(3,), m/s^2."""
     spread: float
-    """Largest distance from that position, m ..."""
+    """Largest distance of the neighbor from ``position``, m."""
     spreading: float
-    """... and its growth rate, m/s."""
+    """Growth rate of ``spread``, m/s."""
     later: list[float]
-    """Velocity after TRUSTED_TIME if the acceleration lasts (3,), m/s."""
+    """Velocity (3,), m/s, after TRUSTED_TIME if the acceleration continues."""
 
 
 def predict(n: Neighbor, acceleration: Sequence[float], age: float,

@@ -49,7 +49,7 @@ class LimitedCommand(NamedTuple):
     """Reason why it differs from the nominal one, or '': 'a_max', 'v_max', 'a_max, v_max',
     reasons of bounds, or the input that is not finite."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from the neighbor that the guard keeps clear of first, if any."""
+    """Unit vector (3,) away from the neighbor of the most important bound, if any."""
 
 
 def limit_norm(vector: ArrayLike, limit: float) -> Array:

@@ -99,7 +99,7 @@ class Loss(NamedTuple):
     """Coordinate along ``towards`` up to which the last line of sight was free, m, in the
     frame of the odometry."""
     approach: float
-    """Horizontal speed of approach at the loss, m/s; without a place, the largest possible one."""
+    """Horizontal speed of approach at the loss, m/s; the largest possible if unknown."""
     height: float
     """Height of the neighbor at the loss, m."""
     side: Array
@@ -122,52 +122,52 @@ class Memory(NamedTuple):
     own: OwnState | None = None
     neighbors: Mapping[str, Neighbor] = NONE
     flock: Mapping[str, Neighbor] = NONE
-    """The present neighbors and the lost ones, from which the follower keeps clear."""
+    """The present and the lost neighbors from which the follower keeps clear."""
     ranged: Mapping[str, Neighbor] = NONE
-    """The neighbors of which only the distance is known at present."""
+    """The neighbors of which only the distance is known now."""
     motions: Mapping[str, Motion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
-    """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
+    """As ``edges``, of the last step with a followed neighbor; see ``Neighborhood``."""
     edges: frozenset[str] = frozenset()
     faced: str = ''
-    """The neighbor faced in the last step with a followed neighbor."""
+    """The faced neighbor of the last step with a followed neighbor."""
     leader: Neighbor | None = None
-    """Last estimate of the leader that it faced, seen or received."""
+    """Last estimate of the faced leader, seen or received."""
     looking: bool = False
-    """Whether it searches for this leader while it follows other neighbors."""
+    """Whether the vehicle searches for this leader while it follows other neighbors."""
     followed: float | None = None
-    """Stamp of the newest estimate followed since leaving IDLE, s."""
+    """Stamp of the newest estimate that was followed since IDLE, s."""
     lost: Loss | None = None
-    """The loss of the neighbor that it followed, while it lasts."""
+    """The loss of the followed neighbor, while it is lost."""
     given_up: bool = False
-    """Whether it had no neighbor for too long; then it sends no command until engaged again."""
+    """Whether there was no neighbor for too long: then no commands until engaged again."""
     begun: float | None = None
-    """Time at which it left IDLE, s."""
+    """Time at which the state left IDLE, s."""
     altitude: Altitude | None = None
-    """Altitude held since leaving IDLE."""
+    """Altitude to hold since IDLE."""
     yaw: float | None = None
-    """Yaw last commanded since leaving IDLE, rad."""
+    """Last commanded yaw since IDLE, rad."""
     command: Array | None = None
-    """Acceleration last commanded, m/s^2; None if the last step commanded nothing."""
+    """Last commanded acceleration, m/s^2; None if the last step commanded nothing."""
     pending: Array = np.zeros(3)
-    """Velocity that was commanded and is not flown yet (3,), m/s."""
+    """Velocity (3,), m/s, that was commanded, but is not flown yet."""
     drag: Array = np.zeros(3)
-    """Acceleration flown that does not show in the velocity, by drag or wind (3,), m/s^2."""
+    """Acceleration (3,), m/s^2, that drag or wind takes from the flown one."""
     params: PlannerParams | None = None
     """Parameters of the law in the last step; None if the law was not applied."""
     fading: tuple[Array, float] | None = None
-    """The command (3,), m/s^2, from which the law's is faded in, and since when, s."""
+    """Start of the fade-in of the law's command: the command (3,), m/s^2; the time, s."""
     occlusion: Occlusion | None = None
     """Whether the faced neighbor is occluded."""
     jumped: float | None = None
-    """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
+    """Stamp of the last jump of odometry, s: earlier estimates are in another frame."""
     disturbance: Any = None
     """See ``relative.Disturbance``."""
     coming: float = 0.0
-    """Speed, m/s, with which a neighbor may come while odometry is lost; see ``retreat``."""
+    """Speed, m/s, at which a neighbor may approach while odometry is lost; see ``retreat``."""
     switched: float = -math.inf
-    """Time at which odometry was last lost or returned, s: the frame changed then."""
+    """Time at which odometry was last lost or returned, s: then the frame changes."""
 
     def acceleration(self, n: Neighbor) -> list[float]:
         """Return a neighbor's acceleration, (3,), m/s^2; zero for a received one, as outdated."""

@@ -55,15 +55,15 @@ class Neighborhood(NamedTuple):
 
     flock: Sequence[Neighbor]
     shares: Mapping[str, float]
-    """From 0 for none to 1 for an edge: each changes over the time of a handover."""
+    """1 with an edge, 0 without; in between while an edge fades in or out."""
     edges: frozenset[str]
-    """Names of the neighbors with an edge; from the others the vehicle only keeps clear."""
+    """Names of the neighbors with an edge; the vehicle only keeps clear of the others."""
     faced: Neighbor | None
     """The neighbor that the vehicle faces and keeps in sight."""
     level: Neighbor | None
     """The neighbor whose altitude the vehicle follows; None: the altitude is held."""
     distances: Mapping[str, float]
-    """Between the centers, m."""
+    """Distances between the centers, m."""
 
     def clearance(self, n: Neighbor, params: PlannerParams) -> float:
         """Return the distance between the ego hull and a neighbor's, m."""

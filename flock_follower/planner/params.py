@@ -120,13 +120,13 @@ class Edges(NamedTuple):
     margin: float = 0.0
     """Margin to each edge, m."""
     spread: float = 0.0
-    """Largest distance from its expected position, m ..."""
+    """Largest distance of the neighbor from its expected position, m."""
     spreading: float = 0.0
-    """... and its growth rate, m/s."""
+    """Growth rate of ``spread``, m/s."""
     headway: float = 0.0
-    """Headway, s: time for which there is space at the ego speed towards the neighbor, plus ..."""
+    """Headway, s: time for which the near edge leaves space at the closing speed."""
     fastest: float = 0.0
-    """... this speed of the neighbor towards the vehicle, m/s."""
+    """Speed of the neighbor towards the vehicle that the headway assumes, m/s."""
 
     @classmethod
     def of(cls, law: FlockingParams, params: GuardParams) -> Edges:

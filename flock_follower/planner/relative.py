@@ -84,11 +84,11 @@ class Disturbance(NamedTuple):
     """
 
     velocity: Array | None = None
-    """Relative velocity, estimated (3,), m/s."""
+    """Estimated relative velocity (3,), m/s."""
     response: Array = np.zeros(3)
-    """Acceleration commanded, as far as it is flown (3,), m/s^2."""
+    """The part of the commanded acceleration (3,), m/s^2, that is flown already."""
     acceleration: Array = np.zeros(3)
-    """(3,), m/s^2."""
+    """Estimated disturbance (3,), m/s^2."""
 
     def update(self, velocity: Array, command: Array | None, elapsed: float,
                response_time: float) -> Disturbance:

@@ -82,7 +82,7 @@ class FallbackRetreat(NamedTuple):
     velocity: Array
     """Velocity (3,), m/s, to brake to."""
     approach: float
-    """Speed, m/s, with which the neighbor may come meanwhile."""
+    """Speed, m/s, at which the neighbor may approach meanwhile."""
 
 
 def fallback_retreat(memory: Memory, scene: Scene,

@@ -66,13 +66,13 @@ class Decision(NamedTuple):
     yaw: float | None = None
     """Commanded yaw, rad, ENU; None exactly if the acceleration is None."""
     yaw_rate: float = 0.0
-    """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
+    """Rate, rad/s, ENU, that turns the vehicle to the commanded yaw, and with this yaw."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
+    """Unit vector (3,) away from the neighbor to keep clear of; None without one."""
     retreat: Array | None = None
     """Velocity (3,), m/s, to brake to if odometry is lost; None: brake to a hover."""
     stamp: float | None = None
-    """Stamp of the newest estimate that the command is based on, s; None without one."""
+    """Stamp of the newest estimate on which the command is based, s; None without one."""
     limits: str = ''
     """The active limits: of 'a_max', 'v_max' and the reasons of the guard's bounds."""
     rejected: tuple[Rejection, ...] = ()
@@ -81,7 +81,7 @@ class Decision(NamedTuple):
     altitude: float = math.nan
     """The commanded altitude, m; NaN without one."""
     edges: tuple[str, ...] = ()
-    """The neighbors at the ends of its edges; others are only kept clear of."""
+    """The neighbors with an edge; the vehicle only keeps clear of others."""
 
     @property
     def is_guarded(self) -> bool:
@@ -94,15 +94,15 @@ class Scene(NamedTuple):
 
     state: State
     me: OwnState
-    """Own state, predicted to now."""
+    """Ego state, predicted to now."""
     blinded: bool
     """Whether no images are processed."""
     neighbors: Neighborhood
-    """The neighbors at hand in TRACK, else none."""
+    """The present neighbors in TRACK; otherwise empty."""
     leader: Neighbor | None
     """Last estimate of a lost leader to search for while others are followed."""
     missed: Neighbor | None
-    """The lost neighbor: ``leader``, or if none is followed the neighbor that was lost last."""
+    """The lost neighbor: ``leader``, or the last one lost if no neighbor is followed."""
     predictions: Mapping[str, Prediction]
     """Predictions of the neighbors to keep clear of, by name."""
 

@@ -145,9 +145,9 @@ class Occlusion(NamedTuple):
     """A neighbor is missing in consecutive images that should show it."""
 
     lost: float
-    """Stamp of the last estimate before, s."""
+    """Stamp of the last estimate before the occlusion, s."""
     found: float = math.inf
-    """Stamp of the first of the consecutive estimates that may end it, s."""
+    """Stamp of the first of the estimates that may end the occlusion, s."""
 
 
 def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,

@@ -55,21 +55,21 @@ class Altitude(NamedTuple):
     """The altitude to hold, m, and the state of its control, between one step and the next."""
 
     held: float
-    """m."""
+    """Altitude to hold, m."""
     lowest: float
-    """m; the vehicle is lower only if the flight began lower."""
+    """Lowest altitude, m; the vehicle is lower only if the flight began lower."""
     highest: float
-    """m."""
+    """Highest altitude, m."""
     climb: float = 0.0
     """Rate of ``held``, m/s."""
     commanded: float = math.nan
-    """The altitude that the command leads to, m; NaN while neighbors limit the climb."""
+    """The altitude to which the command leads, m; NaN while neighbors limit the climb."""
     neighbor_climb: float | None = None
-    """Vertical velocity of the neighbor that is followed, m/s; None without one."""
+    """Vertical velocity of the followed neighbor, m/s; None without one."""
     ground: float | None = None
     """Height at which the vehicle was armed, m; None if unknown."""
     limits: tuple[float, float] | None = None
-    """``altitude_min`` and ``altitude_max`` that the bounds are of, m."""
+    """``altitude_min`` and ``altitude_max`` that give the bounds, m."""
 
     @classmethod
     def begin(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:

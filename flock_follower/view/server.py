@@ -81,7 +81,7 @@ class _Page:
                  connection: asyncio.BaseProtocol) -> None:
         self.token, self.socket, self.connection = token, socket, connection
         self.greeted = False
-        """Whether it has got the history."""
+        """Whether the page has received the history."""
         self.state: str | None = None
         self.image: bytes | None = None
         self.answers: deque[str] = deque(maxlen=ANSWERS_MAX)
