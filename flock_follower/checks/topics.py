@@ -42,7 +42,7 @@ START: Final = 'ros2 launch flock_follower follower.launch.py'
 
 
 def check_topics(seen: Observations) -> Iterator[Finding]:
-    """Check nodes and topics; of a bag, its content."""
+    """Check nodes and topics; for a bag, check its topics."""
     if seen.live:
         yield check_nodes(seen)
         yield from _clocks(seen)

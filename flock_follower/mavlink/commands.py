@@ -138,8 +138,8 @@ def arm(dialect: Dialect, value: bool, mode: str = '', streaming: bool = False) 
 
     After a landing ArduPilot stays in LAND, and PX4 returns to OFFBOARD or AUTO.TAKEOFF. ArduPilot
     does not arm in LAND. PX4 arms in OFFBOARD only while setpoints are sent (``streaming``), and
-    climbs at once if armed in AUTO.TAKEOFF. So the goal of arming in such a ``mode`` begins with
-    another mode.
+    climbs at once if armed in AUTO.TAKEOFF. So in such a ``mode`` the goal first requests another
+    mode, and then arms.
     """
     stuck = mode in dialect.unarmable_modes and not (streaming and mode == dialect.offboard)
     return Goal(name='arm' if value else 'disarm', command=_ARM, params=(float(value),),

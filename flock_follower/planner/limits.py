@@ -15,9 +15,9 @@
 """
 Limits of acceleration and speed, and braking.
 
-For any float input each function returns a finite vector within its limit; if no limit acts, the
-input bit for bit. Limits act on the length of the vector, never on single axes, so a limited
-command keeps its direction.
+For any float input each function returns a finite vector within its limit. If no limit acts, the
+function returns its input bit for bit. Limits act on the length of the vector, never on single
+axes, so a limited command keeps its direction.
 """
 
 from __future__ import annotations
