@@ -42,7 +42,7 @@ _NEVER: Final = ('depth', 'disparity', 'confidence', 'debug_image', 'zstd', 'ffm
 POSES: Final = ('geometry_msgs/msg/PoseWithCovarianceStamped', 'geometry_msgs/msg/PoseStamped',
                 'geometry_msgs/msg/TransformStamped', 'tf2_msgs/msg/TFMessage')
 #: Parts of the names of poses that are wanted, or of another body.
-_NO_POSE: Final = ('goal', 'setpoint', 'initialpose', 'target', 'static', 'truth')
+_NO_POSE: Final = ('goal', 'setpoint', 'initialpose', 'target', 'static', 'truth', 'neighbors')
 #: The arguments of the launch file by our names of topics.
 _ARGUMENTS: Final = {RAW_IMAGES: 'image', COMPRESSED_IMAGES: 'image', 'camera_info': 'camera_info',
                      'odom': 'odom'}

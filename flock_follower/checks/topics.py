@@ -84,7 +84,7 @@ def check_nodes(seen: Observations) -> Finding:
     return first(
         'nodes', 'each of our three, once',
         (not seen.nodes, ERROR, f'no node is seen on domain {seen.machine.domain}', 'start them; '
-         'set ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE alike here and there'),
+         'check needs their ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE'),
         (twice, ERROR, f'twice: {twice}', 'end one of each: both command the vehicle'),
         (other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
          'check --namespace NAME; or start all in one namespace'),

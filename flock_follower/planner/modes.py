@@ -116,7 +116,7 @@ def odometry_delay(own: OwnState | None, now: float, params: PlannerParams) -> s
     age, latest = now - own.stamp, ALWAYS_LATE_SHARE * params.odom_timeout
     usual = sorted(own.ages)[len(own.ages) // 2] if own.ages else 0.0
     if usual > latest:
-        return f'odometry too slow ({usual:.2f} s old before the next comes)'
+        return f'odometry too slow ({usual:.2f} s old when the next message arrives)'
     longest = max(NEVER_LATE_SHARE * params.odom_timeout,
                   OVERDUE_FACTOR * max(own.ages, default=0.0))
     return f'odometry late ({age:.2f} s)' if age > min(longest, latest) else ''
