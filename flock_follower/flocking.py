@@ -87,8 +87,8 @@ class FlockingParams(Checked):
 
         A subclass may return the acceleration of another controller, for comparisons with the law.
 
-        :param offsets: neighbors' positions minus the ego one, (m, n), m.
-        :param differences: neighbors' velocities minus the ego one, (m, n), m/s.
+        :param offsets: neighbors' positions minus the ego position, (m, n), m.
+        :param differences: neighbors' velocities minus the ego velocity, (m, n), m/s.
         """
         velocities = np.concatenate([np.zeros((1, differences.shape[1])), differences])
         return sum_over_neighbors(offsets, differences, disagreement(velocities), self, 'flocking')
@@ -121,8 +121,8 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
 
     L is computed from the agent and the observed neighbors. Without neighbors the command is zero.
 
-    :param relative_positions: neighbors' positions minus the ego one, (m, n), n = 2 or 3, m.
-    :param relative_velocities: neighbors' velocities minus the ego one, (m, n), m/s.
+    :param relative_positions: neighbors' positions minus the ego position, (m, n), n = 2 or 3, m.
+    :param relative_velocities: neighbors' velocities minus the ego velocity, (m, n), m/s.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
     return params.command(*checked(relative_positions, relative_velocities,

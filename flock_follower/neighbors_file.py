@@ -120,9 +120,9 @@ class PoseSource:
     topic: str = ''
     tf_frame: str = ''
     position_std: float | None = None
-    """Per axis, m, if the message has no covariance; None: it must have one."""
+    """Per axis, m, for a message without covariance; None: a covariance is required."""
     attitude_std: float | None = None
-    """Likewise, rad."""
+    """The same for the attitude, rad."""
     position_only: bool = False
 
 
@@ -135,11 +135,11 @@ class MarkedNeighbor:
     role: str = 'leader'
     """One of ``ROLES``."""
     radius: float = 0.0
-    """Radius of its hull, m."""
+    """Radius of the neighbor's hull, m."""
     tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the antenna is on its body (FLU), m, that ranges are measured to."""
+    """Place of the antenna for ranges on the neighbor's body (FLU), m."""
     source: PoseSource | None = None
-    """Of its poses, if it has no markers."""
+    """Source of the neighbor's poses, if it has no markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +147,10 @@ class NeighborConfig:
     """The neighbors to look for; names and ids are unique, the ids of one dictionary."""
 
     dictionary: str
-    """Of all markers; '' without any."""
+    """Dictionary of all markers; '' without markers."""
     neighbors: tuple[MarkedNeighbor, ...]
     frames_topic: str = ''
-    """Of one message for each image that another detector processes."""
+    """Topic with one message for each image that another detector processes."""
 
     def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
         """Return the neighbors with their markers, by marker id."""

@@ -72,7 +72,7 @@ def transforms(make: Make, states: Iterable[Any], namespace: str = '') -> Any:
     """
     Return the TFMessage of Odometry messages: each pose as that of its child frame.
 
-    :param namespace: precedes the name of each child frame.
+    :param namespace: prefix of the name of each child frame.
     """
     message = make(TRANSFORMS)
     for state in states:
@@ -124,8 +124,8 @@ class RangeState(NamedTuple):
     """
     A Range message in numbers.
 
-    ``stamp`` ns; ``name`` of the neighbor it is to; ``distance``, m; ``limits`` between which it
-    is valid, m, both 0 if unknown; ``variance``, m^2, 0 if unknown.
+    ``stamp``, ns; ``name`` of the neighbor; ``distance``, m; ``limits`` of valid distances, m,
+    both 0 if unknown; ``variance``, m^2, 0 if unknown.
     """
 
     stamp: int
@@ -148,7 +148,7 @@ def stamp_of(data: bytes) -> int:
     """
     Return the stamp, ns, of the bytes of a message that begins with a header.
 
-    :raises ValueError: if there is none.
+    :raises ValueError: if the bytes have no stamp.
     """
     try:
         seconds, nanoseconds = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)

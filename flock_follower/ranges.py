@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Values that a number, or the name of a topic, may take, with their check; remedies for names."""
+"""Valid values of numbers and names of topics, with their check; suggestions for names."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Range:
     """
     Finite numbers from ``low`` to ``high``, both included, in a unit.
 
-    ``above`` excludes ``low`` itself; ``whole`` admits integers only. No limit is infinity.
+    ``above`` excludes ``low`` itself; ``whole`` permits integers only. Infinity means no limit.
     """
 
     low: float = -math.inf
@@ -91,7 +91,7 @@ WORDS: Final = '[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*'
 
 def check_topic(name: str, value: Any) -> None:
     """
-    Check the value of a parameter that is a topic: relative, absolute or private.
+    Check a parameter that is the name of a topic: relative, absolute or private.
 
     :raises ValueError: naming the parameter, its value and the form of a topic.
     """
@@ -108,14 +108,14 @@ def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meanin
     :param default: its default, or ``dataclasses.MISSING``.
     :param valid: the values of a number, or of each of a tuple of numbers; the choices of a text.
     :param meaning: one line without its unit, which ``valid`` has.
-    :param live: whether a node that declares it takes new values in flight; None: no node does.
+    :param live: whether a node accepts new values in flight; None: no node declares it.
     """
     return field(default=default, metadata={'valid': valid, 'meaning': meaning, 'live': live})
 
 
 class Checked:
     """
-    A frozen dataclass whose numbers and choices are checked as it is made, see :func:`parameter`.
+    A frozen dataclass that checks its numbers and choices when it is made, see :func:`parameter`.
 
     :raises ValueError: naming the field, its value and the valid range.
     """
@@ -139,12 +139,12 @@ class Checked:
 
 
 def suggestion(name: str, known: Collection[str], otherwise: str = 'it has') -> str:
-    """Return the known name that is nearest to a wrong one as a question, else all of them."""
+    """Return the most similar known name as a question; if none is similar, all known names."""
     near = difflib.get_close_matches(name, sorted(known), n=1)
     return f'did you mean {near[0]}?' if near else (
         f'{otherwise} {", ".join(sorted(known)) or "none"}')
 
 
 def first_reason(*checks: tuple[object, str]) -> str:
-    """Return the text of the first check that holds, '' if none does."""
+    """Return the text of the first check whose condition is true, '' if there is none."""
     return next((reason for holds, reason in checks if holds), '')

@@ -15,9 +15,9 @@
 """
 Whether a set of parameters can fly: one judgment for nodes, ``check``, ``evaluate``, scenarios.
 
-A range bounds one parameter; the rules here bound combinations, with the camera and the marker if
-they are known. What endangers is refused, with the nearest value that flies. What only performs
-badly is a warning. Flown in docs/guard.md, "Settings".
+Each parameter has a range; the rules here limit combinations, also with the camera and the marker
+if known. A dangerous combination is refused, with the nearest accepted value. A combination that
+only flies badly causes a warning. ``docs/guard.md``, "Settings", has the reasons.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Camera(NamedTuple):
     """The camera and the marker; None: unknown."""
 
     rate: float | None = None
-    """Of the processed images, Hz."""
+    """Rate of the processed images, Hz."""
     marker: float | None = None
     """Width of the marker at a distance of 1 m, px."""
     half_height: float | None = None
@@ -60,13 +60,13 @@ class Camera(NamedTuple):
 
 
 class Judgment(NamedTuple):
-    """One parameter whose value is dangerous, or flies badly, with those of the others."""
+    """A parameter whose value is dangerous, or flies badly, together with the other parameters."""
 
     dangerous: bool
     parameter: str
     value: float
     valid: str
-    """The nearest value that flies: 'at least 2.4 m/s^2'."""
+    """The nearest accepted value, such as 'at least 2.4 m/s^2'."""
     why: str
 
     def __str__(self) -> str:
@@ -80,9 +80,9 @@ UNKNOWN: Final[Camera] = Camera()
 
 def find_unsafe_settings(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> list[Judgment]:
     """
-    Return the settings that are dangerous or fly badly, the dangerous ones first.
+    Return the settings that are dangerous or fly badly, dangerous settings first.
 
-    :param values: of one node or of several, by name; a rule about a missing one is left out.
+    :param values: of one or several nodes, by name; rules about missing values are not applied.
     """
     found = [*_stop(values), *_band(values), *_sight(values, camera), *_height(values, camera),
              *_hidden(values)]
@@ -93,7 +93,7 @@ def refuse(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> None:
     """
     Refuse a set of parameters that is dangerous.
 
-    :raises ValueError: naming the parameter, its value and the nearest value that flies.
+    :raises ValueError: naming the parameter, its value and the nearest accepted value.
     """
     for each in find_unsafe_settings(values, camera):
         if each.dangerous:
@@ -101,7 +101,7 @@ def refuse(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> None:
 
 
 def left_for_motion(a_max: float) -> float:
-    """Return what the offset of the thrust leaves of ``a_max`` for level motion, m/s^2."""
+    """Return the part of ``a_max``, m/s^2, that the thrust offset leaves for horizontal motion."""
     return math.sqrt(max(a_max ** 2 - THRUST_OFFSET_MAX ** 2, 0.0))
 
 

@@ -15,7 +15,7 @@
 """
 Signals that end a program: Ctrl-C (SIGINT), SIGTERM, and SIGHUP, which a closed terminal sends.
 
-The module knows whether this process is one of our programs: a library changes no signals.
+Only our own programs change signals; in other programs this module changes none.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from types import TracebackType
 
 
 def ending() -> tuple[signal.Signals, ...]:
-    """Return the signals that end this process; under nohup SIGHUP is ignored and does not."""
+    """Return the signals that end this process; without SIGHUP under nohup."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return (signal.SIGINT, signal.SIGTERM, *(() if ignored else (signal.SIGHUP,)))
 
 
 def hang_up_as_terminate() -> None:
     """
-    Have SIGHUP send SIGTERM to this process, at once; not under nohup.
+    Make SIGHUP send SIGTERM to this process, at once; not under nohup.
 
-    rclpy wakes its executors for SIGINT and SIGTERM only. A handler of Python waits for the main
-    thread; the thread that sends SIGTERM does not.
+    rclpy wakes its executors for SIGINT and SIGTERM only. A Python handler would wait for the main
+    thread; the thread that sends SIGTERM does not wait.
     """
     if signal.SIGHUP not in ending():
         return

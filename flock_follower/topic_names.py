@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Our names of nodes and topics, the names that drivers give them, and how to connect the two."""
+"""Our names of nodes and topics, the names in drivers, and how to connect the two."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _NEVER: Final = ('depth', 'disparity', 'confidence', 'debug_image', 'zstd', 'ffm
 POSES: Final = ('geometry_msgs/msg/PoseWithCovarianceStamped', 'geometry_msgs/msg/PoseStamped',
                 'geometry_msgs/msg/TransformStamped', 'tf2_msgs/msg/TFMessage')
 #: Parts of the names of poses that are wanted, or of another body.
-_NO_POSE: Final = ('goal', 'setpoint', 'initialpose', 'target', 'static', 'truth')
+_NO_POSE: Final = ('goal', 'setpoint', 'initialpose', 'target', 'static', 'truth', 'neighbors')
 #: The arguments of the launch file by our names of topics.
 _ARGUMENTS: Final = {RAW_IMAGES: 'image', COMPRESSED_IMAGES: 'image', 'camera_info': 'camera_info',
                      'odom': 'odom'}
@@ -57,9 +57,9 @@ _LIKELY: Final = ('infra1', 'mono', 'left', 'fisheye1', 'gray', 'image_rect', 'o
 
 def parse_remaps(remaps: Iterable[str]) -> dict[str, str]:
     """
-    Return the topics by our names, of ``from:=to`` as ROS writes it: ours first.
+    Return the topics by our names, from ``OURS:=THEIRS`` as in ROS.
 
-    :raises ValueError: naming one that is malformed, or whose ``from`` is not one of our names.
+    :raises ValueError: naming a remap that is malformed, or whose first name is not ours.
     """
     found: dict[str, str] = {}
     for remap in remaps:
@@ -92,7 +92,7 @@ def topics_of_camera(image: str, camera_info: str) -> dict[str, str]:
 
 def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
     """
-    Exchange the names of raw and compressed images if the topics hold the other kind.
+    Exchange the names of raw and compressed images if the topics have the other type.
 
     :param names: those of :func:`names_there`, changed in place.
     :param topics: the type of each topic that is there, by its full name.
@@ -105,12 +105,12 @@ def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
 def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = (),
           live: bool = False) -> str:
     """
-    Return how to connect a topic that is missing to the likeliest one that is there, or ''.
+    Return how to connect a missing topic to the most likely existing topic, or ''.
 
-    :param name: ours; ``image_raw`` also stands for the compressed ones.
-    :param topics: the type of each topic that is there, by its full name.
-    :param taken: topics that have another name of ours already.
-    :param live: whether nodes are to be connected, not a bag.
+    :param name: our name; ``image_raw`` also means the compressed images.
+    :param topics: the type of each existing topic, by its full name.
+    :param taken: topics that are used under another of our names.
+    :param live: whether nodes are connected, not a bag.
     """
     msgtypes = (IMAGE, COMPRESSED) if name == RAW_IMAGES else (TYPES[name],)
     found = sorted(

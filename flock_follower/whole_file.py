@@ -26,9 +26,9 @@ from typing import BinaryIO
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     """
-    Open a file for writing that gets its name only once everything in it is on the disk.
+    Open a file for writing; it gets its name only when its complete content is on the disk.
 
-    :raises OSError: naming the file, if it cannot be written; nothing is left of it then.
+    :raises OSError: naming the file, if it cannot be written; then no part of it remains.
     """
     path = Path(path)
     part = path.with_name(f'{path.name}.part')

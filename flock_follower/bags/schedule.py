@@ -55,7 +55,7 @@ class Gaps:
 
     def __init__(self, start_ns: int | None = None) -> None:
         self.skipped_ns = 0
-        """The sum of all steps."""
+        """The sum of all skipped gaps, ns."""
         self._last_ns = start_ns
 
     def take(self, stamp_ns: int) -> float:

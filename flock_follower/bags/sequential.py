@@ -85,7 +85,7 @@ class SequentialReader:
         self.start_time, self.end_time = 2**63, 0
         self._files = files
         self.spans: dict[Path, Span] = {}
-        """Of each file that holds messages."""
+        """A span for each file that holds messages."""
         self._connections: dict[_Channel, Connection] = {}
         self.disorder = 0  # ns by which a message may be older than one before it in its file
 

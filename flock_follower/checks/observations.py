@@ -177,7 +177,7 @@ class Observations:
 
     live: bool = True
     source: str = ''
-    """The bag."""
+    """Path of the bag."""
     duration: float = 0.0
     namespace: str = ''
     names: dict[str, str] = field(default_factory=dict)
@@ -192,7 +192,7 @@ class Observations:
     sources: dict[str, SourceSeen] = field(default_factory=dict)
     """The poses by another detector, by neighbor."""
     frames_topic: str = ''
-    """Of the images that the other detector processes; '' if the neighbors' file names none."""
+    """Topic of the images that another detector processes; '' without such a topic."""
     static: StaticFrames = field(default_factory=StaticFrames)
     """The frames of tf_static."""
     pictures: list[Picture] = field(default_factory=list)
@@ -201,7 +201,7 @@ class Observations:
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
     """Newest status by the full name of the node, without its first slash."""
     files: dict[str, list[str]] = field(default_factory=dict)
-    """The parameter files by the name of the node, as for ``statuses``; two of two nodes."""
+    """The parameter files by the name of the node, as for ``statuses``."""
     machine: Machine = field(default_factory=Machine)
     incomplete: str = ''
     """Why a bag was never finished."""
@@ -209,7 +209,7 @@ class Observations:
     """Steps in the times of a bag: s after its start, s of the step, whether it interrupts images
     or odometry."""
     set_back: float = 0.0
-    """By how much the clock was set back while a bag was recorded, s: its messages are mixed."""
+    """By how much the clock was set back during the recording of a bag, s."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
 

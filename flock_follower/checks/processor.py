@@ -58,11 +58,11 @@ class Load(NamedTuple):
     """The waiting of some processes over some time."""
 
     share: float
-    """Of the time for which they ran or waited, they waited for a processor that others had."""
+    """Share of the waiting for a processor that other programs used."""
     others: float
-    """Processors that other programs used."""
+    """Number of processors that other programs used."""
     processors: int
-    """Processors that these processes may use."""
+    """Number of processors that these processes may use."""
 
     @property
     def busy(self) -> bool:

@@ -42,7 +42,7 @@ START: Final = 'ros2 launch flock_follower follower.launch.py'
 
 
 def check_topics(seen: Observations) -> Iterator[Finding]:
-    """Check nodes and topics; of a bag, its content."""
+    """Check nodes and topics; for a bag, check its topics."""
     if seen.live:
         yield check_nodes(seen)
         yield from _clocks(seen)
@@ -84,7 +84,7 @@ def check_nodes(seen: Observations) -> Finding:
     return first(
         'nodes', 'each of our three, once',
         (not seen.nodes, ERROR, f'no node is seen on domain {seen.machine.domain}', 'start them; '
-         'set ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE alike here and there'),
+         'check needs their ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE'),
         (twice, ERROR, f'twice: {twice}', 'end one of each: both command the vehicle'),
         (other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
          'check --namespace NAME; or start all in one namespace'),

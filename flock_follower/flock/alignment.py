@@ -178,7 +178,7 @@ VARIANCE_FACTOR = 4.0  # on the variances of a fit: errors of sightings are corr
 OUTLIER_CHI2 = 25.0  # chi^2 (3 degrees of freedom) above which a pair is excluded from a fit
 MIN_AGREEING_SHARE = 0.7  # share of the pairs that must fit
 Pair = tuple[TrackPoint, TrackPoint]
-"""Track points of one vehicle in another frame and in the ego one, at one stamp."""
+"""Track points of one vehicle in another frame and in the ego frame, at one stamp."""
 
 
 def first_fit(pairs: Sequence[Pair]) -> Frame | None:

@@ -72,8 +72,8 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     which would be infinite from d1 on, is at most ``most``: an edge longer than the band does not
     outweigh all others.
 
-    :param offsets: the neighbors' positions minus the ego one (m, n), m.
-    :param differences: their velocities minus the ego one (m, n), m/s.
+    :param offsets: the neighbors' positions minus the ego position (m, n), m.
+    :param differences: their velocities minus the ego velocity (m, n), m/s.
     :param share: (m,) 1 with an edge, 0 without an edge, in between while an edge fades in or out.
     :param others: (m,) whether a neighbor is not in the flock: separation with the L of the pair.
     :param most: largest cohesion with one neighbor, m/s^2.

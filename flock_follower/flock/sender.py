@@ -42,27 +42,27 @@ class Sender:
     name: str
     states: dict[str, OdometryState] = field(default_factory=dict)
     tracks: defaultdict[str, Track] = field(default_factory=lambda: defaultdict(Track))
-    """Tracks of vehicles in its frame."""
+    """Tracks of vehicles in the sender's frame."""
     frame: Frame | None = None
-    """Estimate of its frame; None while it is not known."""
+    """Estimate of the sender's frame; None while it is unknown."""
     hops: float = math.inf
-    """1 if its frame is related to the ego one directly, 2 by one other sender, ..."""
+    """1 if its frame is related to the ego frame directly, 2 by one other sender, ..."""
     pairs: deque[Pair] = field(default_factory=lambda: deque(maxlen=MAX_PAIRS))
     """Relations until the first fit."""
     yaw_std: float = math.pi
-    """Standard deviation of the yaw of its frame, rad, at the last fit."""
+    """Standard deviation of the yaw of the sender's frame, rad, at the last fit."""
     related: dict[str, int] = field(default_factory=dict)
     """Stamps of the last relations, ns, by vehicle."""
     refused: int = 0
-    """Relations refused in a row."""
+    """Number of successive relations that were refused."""
     received: int = 0
-    """When its last message was received, ns."""
+    """Time at which the sender's last message was received, ns."""
     ages: deque[float] = field(default_factory=lambda: deque(maxlen=N_AGES))
-    """Ages of its last messages on reception, s."""
+    """Ages of the sender's last messages at their reception, s."""
     sent: deque[int] = field(default_factory=lambda: deque(maxlen=BURST_COUNT))
-    """Stamps of the last states of itself, ns."""
+    """Stamps of the sender's last own states, ns."""
     ban: tuple[int, str] = (0, '')
-    """Until when, ns, and why it is ignored."""
+    """The time until which the sender is ignored, ns, and the reason."""
 
     def sent_at(self, stamp: int, received: int) -> None:
         """Record the stamp of the sender's own state; ignore a sender that sends too often."""

@@ -73,7 +73,7 @@ class DisturbanceObserver:
         self.acceleration: Array = np.zeros(3)
         """The estimate (3,), m/s^2, ENU."""
         self.excess_since = math.inf
-        """Since when the error of the thrust is excessive, s; infinite: it is not."""
+        """Time since which the thrust error has been excessive, s; infinite if it is not."""
         self._velocity: Array | None = None
         self._response: Array = np.zeros(3)
         self._contradicted_since = math.inf

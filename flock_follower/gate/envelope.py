@@ -134,11 +134,11 @@ class Location(NamedTuple):
     """The vehicle's location in its envelope."""
 
     height: float | None = None
-    """m; None if it is unknown: then it is not bounded."""
+    """Height, m; None if unknown: then no height bound acts."""
     climb_rate: float = 0.0
-    """m/s, by the source of the height."""
+    """Climb rate, m/s, by the sensor of the height."""
     offset: Array | None = None
-    """(2,), m, horizontally from where it became ACTIVE; None before."""
+    """Horizontal offset (2,), m, from the position at ACTIVE; None before."""
 
 
 def approach_speed(distance: float, deceleration: float) -> float:
@@ -260,9 +260,9 @@ class HeightEstimator:
 
     def __init__(self) -> None:
         self.stepped = -math.inf
-        """When the sensor, and so the reference, has jumped last, s."""
+        """Time of the last jump of the sensor, and so of the reference, s."""
         self.leapt = -math.inf
-        """When two altitudes in a row differed by more than SENSOR_LEAP last, s."""
+        """Time of the last two successive altitudes that differed by more than SENSOR_LEAP, s."""
         self._newest = math.nan  # altitude by the sensor, m
         self._altitude = 0.0
         self._velocity_error = 0.0

@@ -106,11 +106,11 @@ class Handover(NamedTuple):
     """Why the bridge itself hands the vehicle over, and what follows."""
 
     why: str = ''
-    """As text; '' for no handover."""
+    """Reason as text; '' if there is no handover."""
     action: str = HOLD
-    """HOLD, or LAND: a landing after the hold mode."""
+    """HOLD, or LAND for a landing after the hold mode."""
     cause: Cause = Cause.ENDED
-    """For the permission."""
+    """The reason as a value, for the permission."""
 
 
 NO_HANDOVER: Final[Handover] = Handover()

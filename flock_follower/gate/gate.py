@@ -68,11 +68,11 @@ class Commands:
     """The commands that were accepted."""
 
     newest: AcceptedCommand | None = None
-    """The newest one that may be flown."""
+    """The newest accepted command."""
     is_new: bool = False
-    """Whether it was accepted since the last decision."""
+    """Whether the newest command was accepted since the last decision."""
     received: float = -math.inf
-    """Time at which one was accepted last, s."""
+    """Time at which a command was last accepted, s."""
 
 
 @dataclass
@@ -81,15 +81,15 @@ class ReportedFlight:
 
     status: VehicleStatus | None = None
     airborne: bool | None = None
-    """Whether it reports that it flies; None if it does not report."""
+    """Whether the autopilot reports that the vehicle flies; None without a report."""
     was_active: bool = False
-    """Whether it has been ACTIVE since offboard was last requested."""
+    """Whether the permission has been ACTIVE since the last request of offboard."""
     active_since: float = math.inf
-    """Time from which it has been ACTIVE, s."""
+    """Time since which the permission has been ACTIVE, s."""
     landed_since: float = math.inf
-    """Time since which it has reported "landed" at a low height, s."""
+    """Time since which the autopilot has reported "landed" at a low height, s."""
     heightless_since: float = math.inf
-    """Time from which its height has been missing, s."""
+    """Time since which the height has been missing, s."""
 
     @property
     def is_armed(self) -> bool:
@@ -102,13 +102,13 @@ class Flown:
     """The last setpoint, and the yaw and height that braking holds; None if unknown."""
 
     acceleration: Array | None = None
-    """(3,), m/s^2, if the vehicle flies it."""
+    """Acceleration (3,), m/s^2, of the last setpoint; None if it is not flown."""
     commanded: bool = False
     """Whether the last setpoint was a command."""
     yaw: float | None = None
-    """rad: of the last command, or of the vehicle before."""
+    """Yaw, rad, of the last command; before the first, of the vehicle."""
     held: Held | None = None
-    """Yaw and height where braking began."""
+    """Yaw and height at the beginning of braking."""
     start: Array | None = None
     """Position (3,), m, from which the radius counts."""
 
@@ -136,7 +136,7 @@ class Gate:
             self.limits.relative_timeout if self.limits.relative_flight else 0.0)
         self.commands = Commands()
         self.situation: Situation | None = None
-        """That of the last decision."""
+        """The situation of the last decision."""
         self._flight = ReportedFlight()
         self._flown = Flown()
         self._disturbance = DisturbanceObserver()

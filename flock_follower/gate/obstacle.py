@@ -48,7 +48,7 @@ class Refusal(NamedTuple):
 
     cause: Obstacle
     detail: str = ''
-    """The text for people; '': that of the obstacle."""
+    """The text for people; '' for the text of the obstacle."""
 
     def __str__(self) -> str:
         return self.detail or self.cause.value

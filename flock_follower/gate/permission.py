@@ -56,7 +56,7 @@ class Cause(enum.Enum):
 
     NOT_REQUESTED = enum.auto()
     WAITING = enum.auto()
-    """Offboard was requested, and is not flown yet."""
+    """Offboard was requested, but the vehicle is not in the mode yet."""
     FAILED = enum.auto()
     """The vehicle refused the request, or did not execute it in time."""
     ENDED = enum.auto()
@@ -64,7 +64,7 @@ class Cause(enum.Enum):
     STICK = enum.auto()
     """A request ended the flight because the pilot moved a stick."""
     CONTESTED = enum.auto()
-    """Two nodes give commands."""
+    """Two nodes publish commands."""
     SILENT = enum.auto()
     """The bridge stopped sending, because no velocity was valid."""
     MODE_UNKNOWN = enum.auto()
@@ -82,7 +82,7 @@ class Taker(NamedTuple):
 
     text: str
     pilot: bool
-    """Whether it is a pilot, or may be one."""
+    """Whether the taker is a pilot, or may be a pilot."""
 
 
 UNKNOWN: Final[Taker] = Taker('pilot or failsafe: unknown', True)
@@ -105,20 +105,20 @@ class Permission:
 
     phase: Phase = Phase.INACTIVE
     reason: str = NOT_REQUESTED
-    """Why it is not ACTIVE, as text; '' if it is."""
+    """Why the permission is not ACTIVE, as text; '' if it is."""
     since: float = math.inf
-    """When offboard was last requested, s; earlier HEARTBEATs are ignored."""
+    """Time of the last request of offboard, s; earlier HEARTBEATs are ignored."""
     received: float = math.inf
-    """When the newest message with the mode was received since then, s, if any."""
+    """Time of the newest message with the mode since ``since``, s, if any."""
     obeyed: bool = False
-    """Whether the vehicle has been in the mode that obeys setpoints since then."""
+    """Whether the vehicle has been in the offboard mode since ``since``."""
     unseen: bool = False
     """Whether the bridge fell silent while the mode was unknown: the next mode shows whether the
     pilot has switched."""
     cause: Cause | None = Cause.NOT_REQUESTED
-    """The same for code; None if it is ACTIVE."""
+    """Why the permission is not ACTIVE, as a value; None if it is."""
     taker: Taker = UNKNOWN
-    """While TAKEN_OVER, who has changed the mode; after a stick moved, STICK until a request."""
+    """While TAKEN_OVER, who changed the mode; after a moved stick STICK, until a request."""
     left_for: str = ''
     """While TAKEN_OVER, the mode that was flown instead."""
 

@@ -53,9 +53,9 @@ class Relative(NamedTuple):
     """The permission for commands that are based on the marker only."""
 
     lasted: float = math.nan
-    """Time flown without odometry, s; NaN: not permitted now."""
+    """Time flown without odometry, s; NaN if it is not permitted now."""
     begins: bool = False
-    """Whether it has just begun, so that no command can have arrived yet."""
+    """Whether the flight without odometry has just begun: no command can have arrived."""
 
 
 class Reckoning:
@@ -102,7 +102,7 @@ class RelativeFlight:
     def __init__(self, timeout: float) -> None:
         self._timeout = timeout
         self.reckoning: Reckoning | None = None
-        """The motion while it lasts."""
+        """The motion during flight without odometry."""
         self._begun = math.inf
         self._spent = 0.0  # s, flown without odometry and not yet made up for
         self._usable_since = math.inf

@@ -84,15 +84,15 @@ class Setpoint(NamedTuple):
     kind: str
     """'command', 'brake', 'level' (zero acceleration) or 'none' (send nothing)."""
     reason: str
-    """Why it is no command; '' if it is."""
+    """Why the setpoint is not the command; '' if it is."""
     acceleration: Array
-    """(3,), m/s^2."""
+    """Acceleration (3,), m/s^2."""
     yaw: float | None
-    """rad; None without one."""
+    """Yaw, rad; None if there is none."""
     limited: str
-    """The limits that changed it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
+    """The limits that changed the command: 'a_max', 'v_max', 'envelope', joined by commas."""
     cause: Obstacle | None = None
-    """Why it is no command, for code; None if it is."""
+    """Why the setpoint is not the command, as a value; None if it is."""
 
 
 def decide(situation: Situation) -> Setpoint:

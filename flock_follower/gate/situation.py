@@ -44,32 +44,31 @@ class AcceptedCommand(NamedTuple):
 
     command: Command
     time: float
-    """When it applies, s."""
+    """Time for which the command was made, s."""
     source_time: float
-    """When the image it rests on was taken, s."""
+    """Time of the image on which the command is based, s."""
 
 
 class Held(NamedTuple):
     """Yaw and height to keep without a command; None if unknown."""
 
     yaw: float | None = None
-    """rad."""
+    """Yaw, rad."""
     height: float | None = None
-    """m."""
+    """Height, m."""
 
 
 class VehicleReport(NamedTuple):
     """The autopilot's report of the vehicle, and the age of this report."""
 
     armed: bool
-    """Whether it is armed; while it is not, setpoints are level."""
+    """Whether the vehicle is armed; if not, setpoints are level."""
     airborne: bool
-    """Whether it flies: on the ground PX4 takes any upward acceleration as a request to take
-    off."""
+    """Whether the vehicle flies: on the ground PX4 takes off for any upward acceleration."""
     link_age: float
-    """Time since the autopilot is missing, s."""
+    """For how long messages of the autopilot have been missing, s."""
     mode_age: float
-    """Time since a message last had the mode, s: the pilot may have switched since."""
+    """Time since the last message with the mode, s: the pilot may have switched since."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,27 +77,27 @@ class Situation:
 
     now: float
     limits: GateLimits
-    """Those of commands; they may be lower than at start."""
+    """Limits of commands; they may be lower than at the start."""
     start_limits: GateLimits
-    """Those at start, for braking and separation."""
+    """Limits at the start, for braking and separation."""
     known: KnownMotion
-    """The vehicle's motion, as far as it is known."""
+    """The known motion of the vehicle."""
     report: VehicleReport
     command: AcceptedCommand | None
     """The newest command."""
     withheld: str
-    """Why nothing may be sent at all, such as a pilot who has taken over; '' permits."""
+    """Why no setpoint may be sent, such as a takeover by the pilot; '' if it may."""
     unplaced: Refusal | None
-    """Why height or position, known before, cannot be used now."""
+    """Why a height or position that was known before cannot be used now."""
     place: Location
     """The vehicle's location in its envelope."""
     held: Held
     relative: Relative
-    """Whether a command may rest on the marker alone."""
+    """Whether a command may be based on the marker only."""
     offset: ArrayLike
     """The acceleration (3,), m/s^2, that offsets the disturbance."""
     retreat: ArrayLike | None = None
-    """Velocity (3,), m/s, to brake to, as odometry is lost; None: to a hover."""
+    """Velocity (3,), m/s, to brake to without odometry; None: to a hover."""
 
     @property
     def command_age(self) -> float:

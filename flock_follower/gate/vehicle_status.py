@@ -32,8 +32,8 @@ class AutopilotTraits(NamedTuple):
     """Properties of the autopilot that the gate depends on."""
 
     hover_thrust: str = 'the hover thrust'
-    """Its parameter of the hover thrust."""
+    """The autopilot's parameter of the hover thrust."""
     needs_wind_offset: bool = False
     """Whether setpoints offset the wind, because the autopilot does not."""
     fused: bool = False
-    """Whether its estimate fuses our odometry, and so cannot confirm the odometry."""
+    """Whether the autopilot's estimate fuses our odometry, so that it cannot confirm it."""

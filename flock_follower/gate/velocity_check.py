@@ -67,20 +67,20 @@ class Velocity(NamedTuple):
     """A velocity that is fresh, finite, and at most ``FASTEST_OWN``."""
 
     vector: Array
-    """(3,), m/s."""
+    """Velocity (3,), m/s."""
     margin: float
-    """Increase of time constants by the age of the velocity, s."""
+    """Increase of time constants because of the age of the velocity, s."""
 
 
 class MotionReport(NamedTuple):
     """The vehicle's motion in one message of a source."""
 
     velocity: ArrayLike
-    """(3,), m/s."""
+    """Velocity (3,), m/s."""
     yaw: float = math.nan
-    """rad; NaN without one."""
+    """Yaw, rad; NaN if unknown."""
     position: ArrayLike | None = None
-    """(3,), m, in the frame of the source."""
+    """Position (3,), m, in the frame of the source."""
     std: float = 0.0
     """Standard deviation of the position, m."""
 
@@ -96,11 +96,11 @@ class SourceMotion(NamedTuple):
     """The newest motion by one source; an age is infinite before its first message."""
 
     velocity: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,), m/s."""
+    """Velocity (3,), m/s."""
     velocity_age: float = math.inf
     """s."""
     yaw: float = 0.0
-    """rad."""
+    """Yaw, rad."""
     yaw_age: float = math.inf
     """s."""
 
@@ -124,17 +124,17 @@ class KnownMotion(NamedTuple):
     source: str
     """'odom' or 'autopilot': source of the velocity that is required for commands."""
     velocity: Velocity | None
-    """By the source; None if it is not fresh."""
+    """Velocity by the source; None if it is not fresh."""
     never: bool
     """Whether the source has not sent a velocity yet."""
     braking: Velocity | None
-    """The velocity to brake with; None if none is fresh, or if two disagree."""
+    """The velocity for braking; None if no velocity is fresh, or if two disagree."""
     contradiction: Obstacle | None
     """The contradiction between odom and the autopilot, if any."""
     blind: bool
     """Whether every velocity has been invalid for too long, after a valid velocity."""
     turned: float | None
-    """Yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
+    """Yaw of odom minus that of the autopilot, rad; None if a yaw is not fresh."""
     difference: Array | None
     """Velocity of odom minus that of the autopilot (3,), m/s, if odom is the source and both are
     fresh; else None."""
@@ -284,9 +284,9 @@ class Path:
 
     def __init__(self) -> None:
         self.position: Array | None = None
-        """The newest, m, in the frame of the source without its jumps."""
+        """The newest position, m, in the frame of the source without its jumps."""
         self.time = -math.inf
-        """That of the newest, s."""
+        """Time of the newest position, s."""
         self._velocity: Array | None = None
         self._shift: Array | float = 0.0
         self._kept: deque[tuple[float, Array]] = deque()
@@ -381,7 +381,7 @@ class Source:
         self.velocity: Array = np.zeros(3)
         self.velocity_time = -math.inf
         self.position: Array | None = None
-        """The newest, m, in the frame of the source."""
+        """The newest position, m, in the frame of the source."""
         self.yaws: deque[tuple[float, float]] = deque()
         self.path = Path()
         self.std = 0.0

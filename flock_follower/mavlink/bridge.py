@@ -113,9 +113,9 @@ class Bridge:
                                  self.end, require_failsafe)
         self.status = self.requests.status
         self.motion: tuple[OdometryState, float] | None = None
-        """During flight without odometry: the motion by the attitude, and its time, s."""
+        """The motion by the attitude during flight without odometry, and its time, s."""
         self.handover: Request | None = None
-        """The request by which the bridge itself ended the flight last, if any."""
+        """The last request by which the bridge itself ended a flight, if any."""
         self.ground_station = GroundStationReport()
         self._reports = report_to_gcs
         gate.autopilot = gate.autopilot._replace(fused=forwarder is not None)

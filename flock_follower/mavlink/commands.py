@@ -60,11 +60,11 @@ class Vehicle(NamedTuple):
 
     status: VehicleStatus
     altitude: float | None = None
-    """m above the origin of its local frame."""
+    """Altitude above the origin of the local frame, m."""
     shown_time: float = math.inf
-    """When HEARTBEAT or CURRENT_MODE last showed the requested state, s."""
+    """Time at which HEARTBEAT or CURRENT_MODE last showed the requested state, s."""
     airborne: bool = True
-    """Whether it reports that it flies; None without a report."""
+    """Whether the autopilot reports that the vehicle flies; None without a report."""
 
 
 class Outcome(NamedTuple):
@@ -83,21 +83,21 @@ class Goal:
     params: tuple[float, ...]
     reached: Callable[[Vehicle], bool]
     modes: tuple[str, ...] = ()
-    """The modes that it leads through; (): any. In any other mode the pilot has taken over."""
+    """The modes during the request; (): any. In another mode the pilot has taken over."""
     ends_flight: bool = False
-    """Whether it ends our control of the vehicle: it waits for no other request or HEARTBEAT."""
+    """Whether it ends our control of the vehicle; then it is sent without waiting."""
     insists: bool = False
-    """Whether the command is sent even if the vehicle already is in the requested state."""
+    """Whether the command is sent even if the vehicle is already in the requested state."""
     timeout: float = CONFIRM_TIMEOUT
     """Time to wait for the requested state, s."""
     stream: float = 0.0
-    """Time for which setpoints must have been sent before, s."""
+    """Time for which setpoints must be sent before the command, s."""
     before: Goal | None = None
     """The goal to reach first."""
     instead: Goal | None = None
-    """The request that replaces it if the autopilot refuses it."""
+    """The goal that replaces this goal if the autopilot refuses it."""
     too_late: Goal | None = None
-    """The request that replaces it if it is not reached in time."""
+    """The goal that replaces this goal if it is not reached in time."""
 
 
 def enter(dialect: Dialect, mode: str, *others: str, ends_flight: bool = False) -> Goal:
@@ -140,8 +140,8 @@ def arm(dialect: Dialect, value: bool, mode: str = '', streaming: bool = False) 
 
     After a landing ArduPilot stays in LAND, and PX4 returns to OFFBOARD or AUTO.TAKEOFF. ArduPilot
     does not arm in LAND. PX4 arms in OFFBOARD only while setpoints are sent (``streaming``), and
-    climbs at once if armed in AUTO.TAKEOFF. So the goal of arming in such a ``mode`` begins with
-    another mode.
+    climbs at once if armed in AUTO.TAKEOFF. So in such a ``mode`` the goal first requests another
+    mode, and then arms.
     """
     stuck = mode in dialect.unarmable_modes and not (streaming and mode == dialect.offboard)
     return Goal(name='arm' if value else 'disarm', command=_ARM, params=(float(value),),
@@ -196,7 +196,7 @@ class Request:
 
     def _begin(self, goal: Goal, now: float, mode: str) -> None:
         self.current = goal
-        """The present goal: ``goal``, or the one before it, or the one that replaces it."""
+        """The present goal: ``goal``, the goal before it, or its replacement."""
         self._since = self._last_sent = now  # since the beginning, then since the first command
         self._attempts = 0
         self._mode = mode  # the vehicle's at the beginning

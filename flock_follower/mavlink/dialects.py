@@ -80,9 +80,9 @@ class Rule(NamedTuple):
     name: str
     forbidden: Callable[[float], bool]
     advice: str
-    """Text after NAME = VALUE: reason and remedy."""
+    """Reason and remedy, printed after NAME = VALUE."""
     forwarding: bool = False
-    """Whether it matters only if odometry is forwarded."""
+    """Whether the rule matters only if odometry is forwarded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,9 +94,9 @@ class Dialect:
     title: str
     """Name for people."""
     firmware: int
-    """MAV_AUTOPILOT."""
+    """Value of MAV_AUTOPILOT."""
     vehicle_types: frozenset[int]
-    """The values of MAV_TYPE that it is for."""
+    """The supported values of MAV_TYPE."""
     modes: Mapping[str, int]
     """custom_mode by the name of the mode."""
     sub_modes: bool
@@ -104,62 +104,61 @@ class Dialect:
     offboard: str
     """The mode that obeys our setpoints."""
     hold: str
-    """The mode that keeps the position, requested when offboard ends."""
+    """The mode that holds the position, requested when offboard ends."""
     hold_instead: tuple[str, ...]
     """Modes requested in turn if ``hold`` is refused; the last one descends."""
     arming_modes: tuple[str, ...]
-    """Modes in which it arms, requested in turn if it does not arm in the present one."""
+    """Modes in which it arms, requested in turn if it does not arm in the present mode."""
     unarmable_modes: tuple[str, ...]
-    """Modes in which a flight may end, and in which it does not arm, or flies once armed."""
+    """Modes after a flight in which the vehicle does not arm, or takes off once armed."""
     land: str
     """The mode that lands at the present place."""
     takeoff_modes: tuple[str, ...]
     """The modes during and after a take-off."""
     takeoff_above_sea: bool
-    """Whether the height of NAV_TAKEOFF is above mean sea level, else above home."""
+    """Whether the height in NAV_TAKEOFF is above mean sea level; if not, above home."""
     minimum_takeoff: str
-    """Parameter of the least height of a take-off, m, whatever NAV_TAKEOFF requests; or ''."""
+    """Parameter of the least height of a take-off, m; NAV_TAKEOFF cannot be lower; or ''."""
     setpoints_end_takeoff: bool
-    """Whether a setpoint during a take-off ends it, and one on the ground has no effect."""
+    """Whether a setpoint ends a take-off, and has no effect on the ground."""
     stream_before_offboard: float
     """Time for which setpoints must be sent before the autopilot accepts offboard mode, s."""
     compensates_wind: bool
     """Whether the autopilot controls accelerations in a closed loop, which rejects wind."""
     bytewise_parameters: bool
-    """Whether PARAM_VALUE carries integers as their bytes, else as a float of their value."""
+    """Whether PARAM_VALUE has the bytes of an integer; if not, its value as a float."""
     odometry_frame: int
-    """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it accepts, with the child BODY_FRD."""
+    """The only accepted ``frame_id`` (MAV_FRAME) of ODOMETRY; the child is BODY_FRD."""
     estimator_status: int
     """Message id of the status of its estimator, ESTIMATOR_STATUS or EKF_STATUS_REPORT."""
     velocity_flags: tuple[int, int]
-    """Flags of that status that are set, and those that are clear, if it has a velocity."""
+    """Flags of this status that are set, and flags that are clear, if it has a velocity."""
     gps_switch: str
-    """Parameter that is 0 if it uses no GPS; '' if zeros are no origin for it."""
+    """Parameter that is 0 if the autopilot uses no GPS; '' if it accepts no zero origin."""
     origin_has_height: bool
-    """Whether the origin is sent with its height; the heights of PX4 would jump by it."""
+    """Whether the origin is sent with its height; with it, PX4's heights would jump."""
     recommendations: str
     """File of recommended parameters in ``config/``."""
     offboard_rules: tuple[Rule, ...]
     """The parameters that forbid offboard."""
     versions: tuple[tuple[int, int], tuple[int, int]]
-    """The oldest and the newest firmware, major and minor, for which both are known."""
+    """The oldest and the newest known firmware, major and minor."""
     watched: tuple[str, ...]
-    """Parameters of failsafe, frame and height that may not change in flight, besides those of
-    ``offboard_rules``."""
+    """More parameters that may not change in flight: failsafe, frame, height."""
     hover_thrust: str
     """Parameter of the hover thrust."""
     mode_message: int
-    """Message id that reports the mode, and so the pilot's switch."""
+    """Id of the message that reports the mode, and so the pilot's switch."""
     mode_rate: float
-    """Rate requested for it, Hz."""
+    """Requested rate of this message, Hz."""
     least_mode_rate: float
-    """Rate at which it then arrives while the mode does not change, Hz."""
+    """Rate of this message while the mode does not change, Hz."""
     pilot_modes: tuple[str, ...] = ()
-    """Modes that no failsafe enters; (): not known."""
+    """Modes that no failsafe enters; () if unknown."""
     position: str = ''
     """The mode that the bridge requests if the pilot moves a stick; '': the hold mode."""
     stick_speed: str = ''
-    """Parameter of the speed above which a stick takes over by itself; '': there is none."""
+    """Parameter of the stick speed above which the autopilot gives control; '' if none."""
     reports_checks: bool = False
     """Whether it answers MAV_CMD_RUN_PREARM_CHECKS by EVENTs that name the failed checks."""
     no_reason: str = ''

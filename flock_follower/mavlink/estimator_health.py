@@ -64,9 +64,9 @@ class GpsFix(NamedTuple):
 
     fixed: bool
     lost: float
-    """When the fix was lost, s; minus infinity if never."""
+    """Time at which the fix was lost, s; minus infinity if never."""
     accuracy: float = 0.0
-    """Standard deviation of its horizontal position, m; 0 if it is not reported."""
+    """Standard deviation of the horizontal position, m; 0 if not reported."""
 
 
 class EstimatorStatus(NamedTuple):
@@ -77,7 +77,7 @@ class EstimatorStatus(NamedTuple):
     has_velocity: bool
     """Whether the estimator has a horizontal velocity, and a source for it."""
     missing: tuple[str, ...]
-    """The names of the flags that a flight needs and that are not set."""
+    """The names of the required flags that are not set."""
 
 
 def estimator_status(message: Any, dialect: Dialect, now: float) -> EstimatorStatus:

@@ -151,7 +151,7 @@ class _Peer:
     """One address, and the vehicle behind it."""
 
     boots: deque[float]
-    """Its newest times of boot on our clock, each by one message, s."""
+    """The newest times of boot on our clock, s, each from one message."""
     place: tuple[float, tuple[float, ...], float] | None = None
     """Time, s, local position, m, and speed, m/s."""
 

@@ -83,7 +83,7 @@ class Framer:
         self.codec = codec
         self._waiting = bytearray()
         self.looks = 0
-        """Number of message starts in the last data, true and false: the cost of parsing."""
+        """Number of start bytes in the last data, true and false: the cost of parsing."""
 
     def feed(self, data: bytes, most: int = 10_000) -> tuple[list[Any], Counter[str]]:
         """

@@ -120,7 +120,7 @@ class LinkQuestions:
             self._questions[name].answer(now)
 
     def answer_time(self, name: str) -> float:
-        """Return the time of the newest answer to a question, s; minus infinity: none."""
+        """Return the time of the newest answer to a question, s; minus infinity if none."""
         question = self._questions.get(name)
         return -math.inf if question is None else question.answered
 

@@ -69,10 +69,10 @@ class Recommendation(NamedTuple):
     value: float
     why: str
     good: tuple[tuple[float, float], ...] = ()
-    """Ranges of the values that are as good; empty: no other is."""
+    """Ranges of other accepted values; empty if there are none."""
     since: tuple[int, int] = _FIRST_VERSION
     until: tuple[int, int] = _LAST_VERSION
-    """The first and last firmware that has it, major and minor."""
+    """``since``, ``until``: first and last firmware that has the parameter, major and minor."""
 
     def differs(self, value: float) -> bool:
         """Return whether a value is neither recommended nor accepted."""
@@ -158,13 +158,13 @@ class CheckResult(NamedTuple):
     differing: int
     unanswered: int
     lines: tuple[str, ...]
-    """For people: each difference, and its reason."""
+    """Text for people: each difference and its reason."""
     missing: tuple[str, ...] = ()
-    """For people: each parameter that does not exist."""
+    """Text for people: each parameter that does not exist."""
     unproven: str = ''
-    """For people: the firmware, if no recommendation is known for it."""
+    """Text for people: the firmware, if there are no recommendations for it."""
     unread: tuple[str, ...] = ()
-    """Names of parameters without an answer: their values are unknown."""
+    """Names of parameters that were not answered."""
 
 
 class ParameterCheck:

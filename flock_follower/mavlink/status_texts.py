@@ -81,7 +81,7 @@ class EventRow(NamedTuple):
     kind: str
     """CHECK, COMMANDER, ACTION or OTHER."""
     text: str
-    """For people."""
+    """Text for people."""
 
 
 def read_events() -> dict[str, EventRow]:
@@ -126,7 +126,7 @@ class Failure(NamedTuple):
 
     text: str
     modes: int
-    """The modes that it applies to, one bit each."""
+    """The affected modes, one bit for each."""
     level: int
     """MAV_SEVERITY."""
 
@@ -144,7 +144,7 @@ class AutopilotText(NamedTuple):
     """One complete text."""
 
     time: float
-    """Time of reception of its end, s."""
+    """Time at which the end of the text was received, s."""
     severity: int
     """MAV_SEVERITY: the smaller, the worse."""
     text: str

@@ -74,7 +74,7 @@ class SensorAltitude(NamedTuple):
 
     time: float
     altitude: float
-    """m; of the barometer in the standard atmosphere, of the rangefinder above the ground."""
+    """Altitude, m: by barometer in the standard atmosphere, by rangefinder above ground."""
     source: str
     """The name of the message."""
 
@@ -86,7 +86,7 @@ class LocalPosition(NamedTuple):
     position: Array
     velocity: Array
     time_boot_ms: int
-    """Its stamp on the autopilot's clock, see ``housekeeping.TimeSync.age``."""
+    """Stamp on the autopilot's clock, see ``housekeeping.TimeSync.age``."""
 
 
 class Attitude(NamedTuple):
@@ -103,11 +103,11 @@ class Battery(NamedTuple):
 
     time: float
     voltage: float
-    """V"""
+    """Voltage, V."""
     current: float
-    """A drawn, positive while discharging."""
+    """Current, A; positive while discharging."""
     remaining: float
-    """Fraction in [0, 1]."""
+    """Remaining charge, from 0 to 1."""
 
 
 class Telemetry:

@@ -72,7 +72,7 @@ class Reports:
     """The last report of each node."""
 
     bridge: str = ''
-    """``mavlink_bridge/state``, also that before the autopilot was lost; '': none yet."""
+    """``mavlink_bridge/state``, after a loss of the autopilot also the state before; or ''."""
     nodes: dict[str, tuple[float, Mapping[str, str]]] = field(default_factory=dict)
     """The time of the last diagnostics of each node, s, and their values."""
     distance: tuple[float, str] = (-math.inf, '')

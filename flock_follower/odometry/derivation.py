@@ -258,7 +258,7 @@ class TwistFrame:
     def __init__(self, wanted: str = AUTO) -> None:
         self.wanted = wanted
         self.found = ''
-        """The frame that fits the positions: one of these; '' before the evidence decides."""
+        """The frame that fits the positions; '' before the evidence decides."""
         self.contradiction: float = 0.0
         """Error of the frame in use, m/s, in the window that last contradicted it."""
         self.windows: deque[Array] = deque(maxlen=600)

@@ -136,8 +136,8 @@ def read_sections(document: Any) -> list[tuple[str, dict[str, Any]]]:
     sections = [*_find_sections('', document)]
     for section, _ in sections:
         if last(section) == _FORMER_SHARED:
-            raise ValueError(f'{section}: no node has this name: name the section of shared '
-                             f'parameters /**, and put it before those of the nodes')
+            raise ValueError(f'{section}: no node has this name: rename it to the section of '
+                             'shared parameters /**, and put it before the sections of the nodes')
     return sections
 
 

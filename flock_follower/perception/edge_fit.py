@@ -281,9 +281,9 @@ class EdgeFit(NamedTuple):
     bloom: float
     lines: Lines
     residual: Array
-    """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
+    """Distance (n,), px, of the edges from the lines at ``pose``, without bloom."""
     weights: Array
-    """(n,), 1/px^2: 0 if an edge was not found."""
+    """Weight (n,), 1/px^2; 0 if an edge was not found."""
 
 
 def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,

@@ -54,7 +54,8 @@ class AlikeErrors:
         """
         Take an update of the state.
 
-        :param remain: the factor (15, 15) on the error state by the update; :param gain: (15, n).
+        :param remain: the factor (15, 15) by which the update reduces the error state; :param
+            gain: (15, n).
         :param root: :func:`root_of` the errors in the measurement, (n, 6); None without errors.
         """
         if self.cross is not None:

@@ -62,7 +62,7 @@ class LearnedNoise:
     """
     The noise of the ego attitude, rad, about each axis, and of the distance, as a share of it.
 
-    ``shares`` are the factors of noise on the variances of a measured position and attitude.
+    ``shares`` says which shares of the variances of a measured position and attitude are noise.
 
     :param initial: initial noise of the attitude, rad; the noise of the distance starts at 0.
     """

@@ -83,7 +83,7 @@ class CameraMotion(NamedTuple):
         return PosePrior(pose, self.T_smooth_camera.rotation[2])
 
     def moving(self, sight: Array) -> Array:
-        """Return the change of the measured state, (15,), per s of offset, for a sight (3,), m."""
+        """Return the change of the measured state (15,) per s of time offset; sight (3,), m."""
         change = np.zeros(15)
         change[POSITION] = np.cross(self.turning, sight) + self.own.velocity
         change[ATTITUDE] = self.turning

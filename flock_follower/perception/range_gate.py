@@ -52,7 +52,7 @@ class RangeGate:
         self._refused = self._judged = 0
         self._before = 0.0  # sign of the last one used, if it was outside
         self.outliers = 0.0
-        """Share of recent distances that was refused."""
+        """Share of recent distances that were refused."""
 
     def judge(self, innovation: float, spread: float) -> tuple[float, float] | None:
         """
@@ -83,7 +83,7 @@ class RangeBias:
 
     def __init__(self) -> None:
         self.value = 0.0
-        """m."""
+        """Bias, m."""
         self.gate = RangeGate()
         self._variance, self._stamp = UNKNOWN_BIAS**2, math.inf
 

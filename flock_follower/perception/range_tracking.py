@@ -186,7 +186,7 @@ class RangeSeries:
         self._since: float | None = None
 
     def take(self, measured: PlacedRange, own: OdometrySample) -> Estimate | None:
-        """Take a range; return the state by the odometry's clock if it is out of sight."""
+        """Take a range; return the state, on the odometry's clock, of a neighbor out of sight."""
         seen = self._seen.newest
         if seen is None:
             return None

@@ -220,21 +220,21 @@ class MountedCamera:
         self.noise.restart()
         self.time_offset.restart()
         self.searched = self.swept = -math.inf
-        """Stamps of the last whole images searched, s: for a missing neighbor; although none."""
+        """Stamps of the last searches of the whole image, s: with, without missing neighbor."""
         self.vain: dict[str, float] = {}
-        """When a neighbor was last looked for without success, by the odometry's clock, s."""
+        """Time, on the odometry's clock, of the last search without success, s."""
         self.newest = -math.inf
         """Stamp of the newest image, s."""
         self.interval = math.inf
-        """Time from the image before to the newest, s."""
+        """Time from the previous image to the newest, s."""
         self.searched_near = False
-        """Whether the last image was searched thoroughly near an expected place, and no more."""
+        """Whether the last image was searched thoroughly near an expected place only."""
         self.portion = 0
         """Number of portions of whole images that were searched."""
         self.unchecked = dict.fromkeys(names, 0)
         """Number of images for which a neighbor's mirrored attitude need not be checked."""
         self.confirmed_at: dict[str, float] = {}
-        """Stamp of the last image in which a neighbor was measured by more than its smear, s."""
+        """Stamp, s, of the last image in which not only a neighbor's smear was measured."""
         self.measured: dict[str, Measurement] = {}
         """The last measurement of each neighbor."""
 

@@ -15,6 +15,6 @@
 """
 The planner: one step from the newest estimates to one safe acceleration.
 
-It holds the state machine, the guard of the band, the limits, altitude and yaw control. The law is
-in ``flocking.py``.
+The folder holds the state machine, the guard of the band, the limits, and the control of altitude
+and yaw. The law is in ``flocking.py``.
 """

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The command nearest to the wanted one that keeps bounds on the acceleration, and the limits.
+Finds the command that keeps the bounds and limits, and is nearest to the wanted command.
 
 The vertical part of a command has priority: only the horizontal part changes.
 """
@@ -51,7 +51,7 @@ class Bound(NamedTuple):
     """A bound on the acceleration a (3,), m/s^2: normal . a >= least."""
 
     normal: Sequence[float]
-    """(3,); it need not be of unit length."""
+    """Normal (3,), of any length."""
     least: float
     reason: str
     distance: float = 0.0
@@ -65,12 +65,14 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     """
     Limit an acceleration whose vertical part has priority over the horizontal one.
 
-    As :func:`limit_command`, but the horizontal part gets the rest of ``a_max`` and ``v_max``: the
-    law's pull may be far beyond both and would leave no climb.
+    As :func:`limit_command`, but the horizontal part only gets what the vertical part leaves of
+    ``a_max`` and ``v_max``: the law may command far more than both, and would leave nothing for
+    the climb.
 
     :param nominal: acceleration (3,), m/s^2; its vertical part is not used.
     :param vertical: acceleration, m/s^2, at most ``a_max``.
-    :param climb: vertical velocity, m/s, to which it finally leads: room is left for that.
+    :param climb: vertical velocity, m/s, that the vertical part will reach; it is reserved in
+        ``v_max``.
     """
     v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
@@ -96,16 +98,17 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     """
     Return the command that keeps the bounds and is nearest to the given one.
 
-    Its vertical part stays as it is. Of all horizontal accelerations with ``|a| <= a_max`` and
-    ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the nearest to ``command`` is taken.
-    With one neighbor: its radial part is clipped to the bounds, or as far towards them as the
-    limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
-    the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
+    The vertical part is not changed. Of all horizontal accelerations with ``|a| <= a_max`` and
+    ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the result is the nearest to
+    ``command``. With one neighbor this means: the radial part is clipped to the bounds, as far as
+    the limits permit. The part across is shortened until the acceleration is within ``a_max`` and
+    the velocity within ``v_max``. A command that keeps all bounds is returned bit for bit.
 
-    If the bounds leave no room they are met one after the other in their order, each as nearly as
-    those before it allow. Cohesion beyond ``v_max`` is met less: only as nearly as by the velocity
-    nearest to ``COHESION_INSISTENCE`` times the correction. Met to the last bit, it would take all
-    speed across for very little, and the command would switch from tick to tick.
+    If not all bounds can be kept, they are met in their order, each as nearly as the bounds before
+    it permit. There is one exception: cohesion that needs more than ``v_max`` is met only as
+    nearly as the velocity nearest to ``COHESION_INSISTENCE`` times the correction meets it. To
+    meet it exactly would use all speed across the line of sight for a very small gain, and the
+    command would alternate from tick to tick.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: ego velocity (3,), m/s.

@@ -15,9 +15,9 @@
 """
 The bounds on a command that one neighbor causes: separation, cohesion, sight.
 
-The guard holds ``sqrt(d0) < r < sqrt(d1)`` if the law alone does not. With p = x_F - x_L from
-the neighbor to the ego vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it bounds the
-rate of the distance so that the change can still be stopped before the edge, less a margin m:
+The guard keeps ``sqrt(d0) < r < sqrt(d1)`` if the law alone does not. With p = x_F - x_L from the
+neighbor to the ego vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w, the guard limits the
+rate s of the distance, so that the vehicle can stop before the margin m inside an edge:
 
     h_near = s + S(r - sqrt(d0) - m) >= 0     S(g) = b (sqrt(tau^2 + 2 g / b) - tau)   for g >= 0
     h_far  = S(sqrt(d1) - m - r) - s >= 0     S(g) = max(g / tau, -EDGE_RETURN_SPEED)  for g < 0
@@ -30,7 +30,7 @@ As ds/dt = n . (a - a_L) + |w_t|^2 / r, with w_t the part of w across n, this re
     n . a >= n . a_L - |w_t|^2 / r - (s + S(g_near)) / T_g - S'(g_near) s
     n . a <= n . a_L - |w_t|^2 / r - (s - S(g_far)) / T_g - S'(g_far) s
 
-of the acceleration a. The unknown part of a_L uses up margin: see ``docs/guard.md``.
+of the acceleration a. The unknown part of a_L reduces the margin, see ``docs/guard.md``.
 
 Behind another follower a headway T_h grows the near edge with the ego speed -n . v_F towards it:
 
@@ -41,15 +41,16 @@ side above, n . a >= (A - S'(g_near) T_h w_t . v_F / r) / (1 + S'(g_near) T_h). 
 velocity of the follower is that of the one ahead through (1 + tau z) / (1 + (tau + T_h) z), z the
 Laplace variable: without delays no motion of a column grows from one follower to the next.
 
-The air below and above another vehicle is disturbed, so the horizontal distance has a bound of
-its own. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
+The air below and above another vehicle is disturbed, so there is a separate bound on the
+horizontal distance. The height of a neighbor out of sight is unknown: only its horizontal distance
+counts.
 
-If only the distance to a neighbor is known (ranges go on after sight is lost), it may be anywhere
-on a sphere around the ego vehicle. The follower then backs away from the last known place. That
-helps as long as the neighbor, no faster than ``v_max``, cannot have reached the other side: in a
-time t it has moved at most v_max t, which must be less than sqrt(r^2 + d^2), with r the distance
-to that place and d the measured distance. Beyond, backing away is a guess, and the fences rank
-above it.
+If only the distance to a neighbor is known (by ranges, out of sight), the neighbor may be anywhere
+on a sphere around the ego vehicle. The follower then backs away from the last known place. This is
+right as long as the neighbor cannot have reached the other side of the sphere: at ``v_max`` it
+moves at most v_max t in a time t, which must be less than sqrt(r^2 + d^2), with r the distance to
+the last known place and d the measured distance. After this time the direction is a guess, and the
+fences have priority.
 """
 
 from __future__ import annotations
@@ -106,9 +107,9 @@ def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], e
 
     :param offset: ego position minus the neighbor's, (3,), m.
     :param relative_velocity: ego velocity minus the neighbor's, (3,), m/s.
-    :param neighbor_acceleration: a_L, the neighbor's, as far as it is known, (3,), m/s^2.
-    :param seen: the neighbor is in sight.
-    :param velocity: ego velocity (3,), m/s; of influence only with a headway.
+    :param neighbor_acceleration: a_L, the known part of the neighbor's acceleration (3,), m/s^2.
+    :param seen: whether the neighbor is in sight.
+    :param velocity: ego velocity (3,), m/s; used only with a headway.
     """
     (x, y, z), w, a = offset, relative_velocity, neighbor_acceleration
     distance = math.hypot(x, y, z)
@@ -141,10 +142,11 @@ def in_sight(it: Prediction, position: Sequence[float], velocity: Sequence[float
     """
     Return the bounds for one neighbor.
 
-    :param position: own (3,), m; :param velocity: own when the command acts (3,), m/s.
-    :param seen: it is in sight; else its last height is unreliable.
-    :param followed: it is followed; else the vehicle only keeps clear of it.
-    :param radii: sum of its radius and the ego one, m.
+    :param position: ego position (3,), m; :param velocity: ego velocity when the command acts
+        (3,), m/s.
+    :param seen: whether the neighbor is in sight; if not, its last height is unreliable.
+    :param followed: whether the neighbor is followed; if not, the vehicle only keeps clear of it.
+    :param radii: sum of the radii of the neighbor and the ego vehicle, m.
     :param headway: see ``Edges``, s.
     """
     inner = params.edges
@@ -165,7 +167,7 @@ def in_sight(it: Prediction, position: Sequence[float], velocity: Sequence[float
 
 def stop(along: Sequence[float], left: float, velocity: Sequence[float],
          params: PlannerParams) -> Bound:
-    """Return the bound with which the vehicle stops along a unit vector within ``left`` m."""
+    """Return the bound that makes the vehicle stop along a unit vector within ``left`` m."""
     guarding, rate = params.guarding, scalar_product(along, velocity)
     # Until the command acts the vehicle keeps its velocity.
     speed, slope = guarding.closing_speed(left - max(rate, 0.0) * params.response_time,
@@ -179,7 +181,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     """
     Return the bound, if any, for a neighbor of which only the distance is known.
 
-    :param known: the last estimate of its position; None without one.
+    :param known: the last estimate of its position; None without an estimate.
     :param velocity: ego velocity when the command acts (3,), m/s.
     """
     acceleration = ZERO_VECTOR if n.acceleration is None else n.acceleration.tolist()
@@ -213,14 +215,14 @@ def sight_bounds(offset: Sequence[float], velocity: Sequence[float], it: Predict
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
 
-    A vehicle that accelerates forward by a lowers its nose, and the camera, by a / g; the yaw
-    follows a neighbor that passes at most at ``yaw_rate_max``:
+    A vehicle that accelerates forward by a lowers its nose, and the camera, by a / g. The yaw
+    follows a passing neighbor at no more than ``yaw_rate_max``:
 
         g (tan(lowest) - tan e) <= f . a <= g (tan(highest) - tan e)    e: elevation
         |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                         f, t: towards it, across
 
-    :param offset: its position minus the ego one, m; :param velocity: the ego one, m/s.
-    :param yaw: the ego one, rad.
+    :param offset: the neighbor's position minus the ego position, m.
+    :param velocity: ego velocity, m/s; :param yaw: ego yaw, rad.
     """
     x, y, z = offset
     distance = math.hypot(x, y)
@@ -246,9 +248,9 @@ def marker_bounds(offset: Sequence[float], velocity: Sequence[float], it: Predic
     """
     Return the bounds on the viewing angle of a neighbor's marker.
 
-    It is the angle between the line of sight and the marker's normal: at most MARKER_ANGLE, and
-    COLUMN_ANGLE behind a follower. The vehicle moves round the neighbor; the arguments are those
-    of ``sight_bounds``.
+    The viewing angle, between the line of sight and the marker's normal, is at most MARKER_ANGLE;
+    behind a follower COLUMN_ANGLE. To keep it, the vehicle moves round the neighbor. The arguments
+    are those of ``sight_bounds``.
 
     :param yaw: the neighbor's, rad.
     """

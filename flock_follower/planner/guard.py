@@ -17,8 +17,8 @@ The guard: the order of all bounds on a command, and the command within them.
 
 Order of the bounds, most important first: separation from neighbors in sight, the fences,
 separation from neighbors out of sight, sight of the faced neighbor, cohesion. Lower-priority
-bounds never relax higher ones, and none of them relaxes ``a_max`` and ``v_max``. The vertical part
-of a command is bounded beforehand (``climb_rates``, ``overflight``).
+bounds never relax higher ones, and no bound relaxes ``a_max`` or ``v_max``. The vertical part of a
+command is limited before (``climb_rates``, ``overflight``).
 
 The bounds of one neighbor are those of :mod:`flock_follower.planner.bounds`.
 """
@@ -151,7 +151,7 @@ def limit_to_retreat(bound: Bound, lost: Loss, position: Array, velocity: Sequen
     """
     Return the bound for a neighbor out of sight, limited by the retreat.
 
-    :param sideways: whether it is the lost neighbor itself: the vehicle leaves its path.
+    :param sideways: whether the vehicle also leaves the neighbor's path, as for the lost neighbor.
     """
     far, offset = retreat(lost, params), HORIZONTAL_AXES * (position - lost.origin)
     direction = np.array(bound.normal)
@@ -172,8 +172,8 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
     """
     Return the nearest command within all limits and bounds.
 
-    :param nominal: horizontal part of the nominal acceleration (3,), m/s^2, without limits.
-    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
+    :param nominal: nominal acceleration (3,), m/s^2, without limits; its horizontal part is used.
+    :param vertical: vertical acceleration, m/s^2; :param climb: rate of the altitude to hold, m/s.
     :param velocity: ego velocity when the command acts (3,), m/s.
     """
     # Limits lowered in flight bind the law and coasting, not braking and keeping clear.

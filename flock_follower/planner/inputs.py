@@ -15,18 +15,18 @@
 """
 Inputs of the planner (ego odometry and neighbors): their validity and prediction.
 
-Nothing here reads a clock. The assumptions about a neighbor at the time when a command acts:
+No function reads a clock. The assumptions about a neighbor at the time when a command acts,
+``response_time`` from now:
 
-1. The neighbor keeps the velocity of its newest estimate, and its acceleration, if plausible, for
-   at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
-   An acceleration a as small as the noise of an estimate counts as
-   a / (1 + (ACCELERATION_NOISE / a)^4): otherwise the noise would make the guard jerk.
+1. The neighbor keeps the velocity of its newest estimate. It also keeps the acceleration, if
+   plausible, for at most TRUSTED_TIME. A small acceleration a, similar to the noise of an
+   estimate, counts as a / (1 + (ACCELERATION_NOISE / a)^4): otherwise the noise would cause jerk.
 2. If the estimate is older than MAX_ACCELERATION_AGE, its acceleration may only increase the
    distance that the vehicle keeps: the vehicle never follows a guess.
-3. Up to FRESH, and up to ``heard_timeout`` if it was received from another vehicle, the margin of
-   the guard covers deviations from 1. Later the neighbor may be anywhere in a growing sphere
-   around the place of 1: it reaches as far as ``leader_acceleration_max`` and ``leader_speed_max``
-   allow.
+3. While the estimate is younger than FRESH (``heard_timeout`` if received from another vehicle),
+   the guard's margin covers deviations from assumption 1. Later the neighbor may be anywhere in a
+   sphere around the place of assumption 1, which grows with ``leader_acceleration_max`` and
+   ``leader_speed_max``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class OwnState(NamedTuple):
     ages: tuple[float, ...] = ()
     """Ages, s, of earlier messages when the next message replaced them; () if unknown."""
     relative: bool = False
-    """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
+    """Whether this is the motion without odometry, in the frame ``messages.RELATIVE``."""
 
 
 UNKNOWN: Array = np.zeros((3, 3))
@@ -76,9 +76,9 @@ class Neighbor(NamedTuple):
     acceleration: Array | None = None
     yaw: float | None = None
     received: bool = False
-    """Whether another vehicle reported it; else a camera of this vehicle sees it."""
+    """Whether another vehicle reported the neighbor; if not, an ego camera sees it."""
     member: Member = SEEN_DEFAULT
-    """Role and size of the neighbor, from its file."""
+    """Role and size of the neighbor, from the neighbors' file."""
 
 
 Moving = TypeVar('Moving', OwnState, Neighbor)
@@ -111,7 +111,7 @@ def untimely(stamp: float, now: float, oldest: float) -> Rejection | None:
 
 
 def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
-    """Return the rejection of a standard deviation, sqrt(trace), too large or unknown, or None."""
+    """Return the rejection of a standard deviation that is too large or unknown, or None."""
     for name, covariance, most in (
             ('position', n.position_covariance, params.max_position_std),
             ('velocity', n.velocity_covariance, params.max_velocity_std)):
@@ -125,19 +125,19 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
 
 
 def too_far(n: Neighbor, own: OwnState | None) -> Rejection | None:
-    """Return the rejection of a neighbor farther away than any can be seen, or None."""
+    """Return the rejection of a neighbor that is too far away to be seen, or None."""
     distance = 0.0 if own is None else math.dist(n.position.tolist(), own.position.tolist())
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
 
 
 def propagate(moving: Moving, now: float) -> Moving:
-    """Return the state carried to ``now`` with constant velocity."""
+    """Return the state predicted for ``now`` with constant velocity."""
     return moving._replace(
         stamp=now, position=moving.position + (now - moving.stamp) * moving.velocity)
 
 
 def find_newest(neighbors: Iterable[Neighbor], own: OwnState) -> Neighbor | None:
-    """Return the newest estimate; of equally new ones the nearest, then the first by name."""
+    """Return the newest estimate; of equally new estimates the nearest, then the first by name."""
     return min(neighbors, default=None, key=lambda n: (
         -n.stamp, math.dist(n.position, own.position), n.name))
 
@@ -170,21 +170,21 @@ class Prediction(NamedTuple):
     """
     The prediction of a neighbor for the time when a command acts.
 
-    Its vectors are lists: arrays of three numbers would take several times as long.
+    The vectors are lists, because arrays of three numbers take several times as long.
     """
 
     position: list[float]
-    """(3,), m, now."""
+    """Position (3,), m, now."""
     velocity: list[float]
-    """(3,), m/s."""
+    """Velocity (3,), m/s."""
     acceleration: list[float]
     """(3,), m/s^2."""
     spread: float
-    """Largest distance from that position, m ..."""
+    """Largest distance of the neighbor from ``position``, m."""
     spreading: float
-    """... and its growth rate, m/s."""
+    """Growth rate of ``spread``, m/s."""
     later: list[float]
-    """Velocity after TRUSTED_TIME if the acceleration lasts (3,), m/s."""
+    """Velocity (3,), m/s, after TRUSTED_TIME if the acceleration continues."""
 
 
 def predict(n: Neighbor, acceleration: Sequence[float], age: float,

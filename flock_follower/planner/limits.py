@@ -15,9 +15,9 @@
 """
 Limits of acceleration and speed, and braking.
 
-Every function here returns a finite vector inside its limit for any float input, and its input
-bit for bit if no limit binds. Limits act on the length of the vector, never
-on its axes one by one, so a limited command keeps its direction.
+For any float input each function returns a finite vector within its limit. If no limit acts, the
+function returns its input bit for bit. Limits act on the length of the vector, never on single
+axes, so a limited command keeps its direction.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class LimitedCommand(NamedTuple):
     """Reason why it differs from the nominal one, or '': 'a_max', 'v_max', 'a_max, v_max',
     reasons of bounds, or the input that is not finite."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from the neighbor that the guard keeps clear of first, if any."""
+    """Unit vector (3,) away from the neighbor of the most important bound, if any."""
 
 
 def limit_norm(vector: ArrayLike, limit: float) -> Array:
-    """Return the vector (n,), shortened to the limit if longer; zeros if not finite."""
+    """Return the vector (n,), shortened to the limit if it is longer; zeros if not finite."""
     v = np.array(vector, dtype=float)
     numbers = v.tolist()
     length = math.hypot(*numbers)
@@ -72,23 +72,22 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     """
     Limit an acceleration, and the speed it leads to when held for one period.
 
-    The acceleration is shortened to ``a_max``, the velocity ``v + a T`` it predicts is projected
-    onto the ball of radius ``v_max``, and the acceleration leading there is shortened to ``a_max``
-    again, each time a little more (``SENT_INSIDE``). So ``|a| <= a_max`` always, in single
-    precision too; ``|v + a T| <= v_max`` whenever ``|v| <= v_max``; and a
-    vehicle faster than that never speeds up. Flight controllers apply no speed limit of their own
-    to acceleration setpoints.
+    The acceleration is shortened to ``a_max``. Then the predicted velocity ``v + a T`` is
+    projected onto the ball of radius ``v_max``, and the acceleration to the projected velocity is
+    again shortened to ``a_max``. Each limit is reduced a little (``SENT_INSIDE``). So ``|a| <=
+    a_max`` always holds, also in single precision; ``|v + a T| <= v_max`` holds if ``|v| <=
+    v_max``; and a faster vehicle never accelerates further. Flight controllers do not limit the
+    speed that results from acceleration setpoints.
 
-    A non-finite acceleration becomes braking with the time constant T, within ``a_max``. With a
-    non-finite velocity no acceleration can be judged: the result is zero.
+    If the acceleration is not finite, the result is braking with the time constant T, within
+    ``a_max``. If the velocity is not finite, the result is zero.
 
     :param acceleration: nominal acceleration (3,), m/s^2.
     :param velocity: present velocity (3,), m/s, in the same frame.
     :param a_max: largest acceleration, m/s^2, above 0.
     :param v_max: largest speed, m/s, at least 0.
     :param period: time T for which the acceleration is held, s, above 0.
-    :param axis: unit vector (3,) along which the acceleration is cut last, because it keeps clear
-        of a neighbor: as much of it is left as the limits allow.
+    :param axis: unit vector (3,) away from a neighbor: along it, the acceleration is reduced last.
     """
     nominal, v = np.asarray(acceleration, dtype=float), np.asarray(velocity, dtype=float)
     requested, flown, strongest = nominal.tolist(), v.tolist(), a_max * SENT_INSIDE
@@ -150,8 +149,8 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     """
     Return the acceleration (3,), m/s^2, that brakes to a hover: ``-v / time_constant``, limited.
 
-    Its length is at most ``a_max``. An unknown (non-finite) velocity gives zeros: an acceleration
-    in a direction that may be wrong is worse than none.
+    Its length is at most ``a_max``. For an unknown (non-finite) velocity the result is zero,
+    because an acceleration in a wrong direction is worse than none.
 
     :param velocity: present velocity (3,), m/s.
     :param a_max: largest acceleration, m/s^2, above 0.

@@ -49,10 +49,11 @@ class PlannerLoop:
     """
     Collects inputs, and passes them to one step of the core per tick.
 
-    The planner is active while it is engaged and the bridge reports that it flies the commands.
-    ``memory`` is the state after the last step; ``missed`` counts the ticks that were not in time.
+    The planner is active while it is engaged, and the bridge reports that it flies the commands.
+    ``memory`` is the state after the last step; ``missed`` counts the late ticks.
 
-    :param require_bridge: whether the bridge must report that; else engaging is enough.
+    :param require_bridge: whether this report is required; if not, the planner need only be
+        engaged.
     """
 
     def __init__(self, require_bridge: bool = True) -> None:
@@ -85,7 +86,7 @@ class PlannerLoop:
         """
         Request commands, or end the request.
 
-        A repeated request changes nothing, unless the planner has given up.
+        A repeated request has no effect, unless the planner has given up.
         """
         self.engaged, self._disengaged_by = requested, ''
         self._interrupted |= not requested or self.memory.given_up
@@ -98,7 +99,7 @@ class PlannerLoop:
         A takeover, by the pilot or a failsafe, disengages the planner: it commands only after it
         is engaged again. The bridge may name the cause later.
 
-        :param silence: time since the message before, s.
+        :param silence: time since the previous message, s.
         """
         # If the vehicle does not fly now, the next tick or the next message finds it waiting.
         self._interrupted |= bool(self.waiting_reason(silence))
@@ -168,7 +169,7 @@ class PlannerLoop:
         """
         Record at a time, ns, that perception has processed the image of a stamp, ns.
 
-        Return whether the stamp is new: a frozen camera repeats a stamp, and counts as no camera.
+        Return whether the stamp is new: the repeated stamp of a frozen camera is not.
         """
         if self._frames and stamp == self._frames[-1]:
             return False
@@ -179,11 +180,11 @@ class PlannerLoop:
         return True
 
     def seconds(self, nanoseconds: int) -> float:
-        """Return the seconds since the first tick: small floats resolve a nanosecond."""
+        """Return the seconds since the first tick, as small floats, which resolve 1 ns."""
         return (nanoseconds - (self._epoch or 0)) * 1e-9
 
     def distance(self) -> tuple[str, float] | None:
-        """Return name and distance, m, of the neighbor faced, else of the nearest, if any."""
+        """Return name and distance, m, of the faced neighbor, else of the nearest, if any."""
         now, me, faced = self.memory.now, self.memory.own, self.memory.faced
         if now is None or me is None or not self.memory.neighbors:
             return None

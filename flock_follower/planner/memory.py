@@ -49,7 +49,7 @@ SMOOTHING_GAP = 1.0  # s without an estimate after which the smoothing begins an
 
 
 class Motion(NamedTuple):
-    """A neighbor's acceleration (3,), m/s^2, smoothed, and its velocity (3,), m/s, at a stamp."""
+    """A neighbor's smoothed acceleration (3,), m/s^2, and its velocity (3,), m/s, at a stamp."""
 
     stamp: float
     velocity: list[float]
@@ -59,9 +59,9 @@ class Motion(NamedTuple):
 def update_motions(motions: Mapping[str, Motion],
                    neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
     """
-    Return the motions of the neighbors, brought up to their newest estimates.
+    Return the motions of the neighbors, updated with their newest estimates.
 
-    The acceleration is that of the estimate, or the change of its velocity if it has none.
+    The acceleration is that of the estimate; if the estimate has none, the change of velocity.
     """
     updated = {}
     for n in neighbors:
@@ -98,7 +98,7 @@ class Loss(NamedTuple):
     """Coordinate along ``towards`` up to which the last line of sight was free, m, in the
     frame of the odometry."""
     approach: float
-    """Horizontal speed of approach at the loss, m/s; without a place, the largest possible one."""
+    """Horizontal speed of approach at the loss, m/s; the largest possible if unknown."""
     height: float
     """Height of the neighbor at the loss, m."""
     side: Array
@@ -115,58 +115,58 @@ NONE: Mapping[str, Any] = {}  # never changed
 
 
 class Memory(NamedTuple):
-    """The state that one step hands to the next; ``Memory()`` is the start."""
+    """The state that one step passes to the next step; ``Memory()`` is the initial state."""
 
     now: float | None = None
     own: OwnState | None = None
     neighbors: Mapping[str, Neighbor] = NONE
     flock: Mapping[str, Neighbor] = NONE
-    """The present neighbors and the lost ones, from which the follower keeps clear."""
+    """The present and the lost neighbors from which the follower keeps clear."""
     ranged: Mapping[str, Neighbor] = NONE
-    """The neighbors of which only the distance is known at present."""
+    """The neighbors of which only the distance is known now."""
     motions: Mapping[str, Motion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
-    """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
+    """As ``edges``, of the last step with a followed neighbor; see ``Neighborhood``."""
     edges: frozenset[str] = frozenset()
     faced: str = ''
-    """The neighbor faced in the last step with a followed neighbor."""
+    """The faced neighbor of the last step with a followed neighbor."""
     leader: Neighbor | None = None
-    """Last estimate of the leader that it faced, seen or received."""
+    """Last estimate of the faced leader, seen or received."""
     looking: bool = False
-    """Whether it searches for this leader while it follows other neighbors."""
+    """Whether the vehicle searches for this leader while it follows other neighbors."""
     followed: float | None = None
-    """Stamp of the newest estimate followed since leaving IDLE, s."""
+    """Stamp of the newest estimate that was followed since IDLE, s."""
     lost: Loss | None = None
-    """The loss of the neighbor that it followed, while it lasts."""
+    """The loss of the followed neighbor, while it is lost."""
     given_up: bool = False
-    """Whether it had no neighbor for too long; then it sends no command until engaged again."""
+    """Whether there was no neighbor for too long: then no commands until engaged again."""
     begun: float | None = None
-    """Time at which it left IDLE, s."""
+    """Time at which the state left IDLE, s."""
     altitude: Altitude | None = None
-    """Altitude held since leaving IDLE."""
+    """Altitude to hold since IDLE."""
     yaw: float | None = None
-    """Yaw last commanded since leaving IDLE, rad."""
+    """Last commanded yaw since IDLE, rad."""
     command: Array | None = None
-    """Acceleration last commanded, m/s^2; None if the last step commanded nothing."""
+    """Last commanded acceleration, m/s^2; None if the last step commanded nothing."""
     pending: Array = np.zeros(3)
-    """Velocity that was commanded and is not flown yet (3,), m/s."""
+    """Velocity (3,), m/s, that was commanded, but is not flown yet."""
     drag: Array = np.zeros(3)
-    """Acceleration flown that does not show in the velocity, by drag or wind (3,), m/s^2."""
+    """Acceleration (3,), m/s^2, that drag or wind takes from the flown one."""
     params: PlannerParams | None = None
     """Parameters of the law in the last step; None if the law was not applied."""
     fading: tuple[Array, float] | None = None
-    """The command (3,), m/s^2, from which the law's is faded in, and since when, s."""
+    """Start of the fade-in of the law's command: the command (3,), m/s^2; the time, s."""
     occlusion: Occlusion | None = None
     """Whether the faced neighbor is occluded."""
     jumped: float | None = None
-    """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
+    """Stamp of the last jump of odometry, s: earlier estimates are in another frame."""
     disturbance: Any = None
     """See ``relative.Disturbance``."""
     coming: float = 0.0
-    """Speed, m/s, with which a neighbor may come while odometry is lost; see ``retreat``."""
+    """Speed, m/s, at which a neighbor may approach while odometry is lost; see ``retreat``."""
     switched: float = -math.inf
-    """Time at which odometry was last lost or returned, s: the frame changed then."""
+    """Time at which odometry was last lost or returned, s: then the frame changes."""
 
     def acceleration(self, n: Neighbor) -> list[float]:
         """Return a neighbor's acceleration, (3,), m/s^2; zero for a received one, as outdated."""
@@ -192,7 +192,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     """
     Return the memory with the valid new inputs, without old inputs, and the rejections.
 
-    The order of the estimates has no influence: all later steps use the order of names.
+    The order of the estimates has no influence, because all later steps sort by name.
     """
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
@@ -270,7 +270,7 @@ Known = TypeVar('Known')
 
 
 def by_name(known: dict[str, Known]) -> dict[str, Known]:
-    """Return a mapping in the order of its names: sums and ties then do not depend on history."""
+    """Return a mapping sorted by name, so that sums and ties do not depend on the history."""
     return dict(sorted(known.items())) if len(known) > 1 else known
 
 
@@ -298,4 +298,3 @@ def update_pending(memory: Memory, command: Array, elapsed: float, params: Plann
 def max_age(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
     return params.heard_timeout if n.received else params.predict_timeout
-

@@ -30,11 +30,11 @@ RELATIVE odometry lost or contradicted, and the bridge     see ``relative``; wit
          flies on (``relative_flight``)                    estimate of 0.5 s no command
 =======  ================================================  ===================================
 
-Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
-let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD the vehicle
-moves a little out of the way of the lost neighbor. In SEARCH and HOLD the planner
-follows again by itself until ``resume_timeout``. After that the state stays, and the planner sends
-no command until it is engaged again. Nothing here reads a clock.
+For a vehicle at rest, braking is zero acceleration; a moving vehicle would drift away with zero
+acceleration. Without fresh odometry no state has a command. In COAST and HOLD the vehicle backs
+away from the lost neighbor. In SEARCH and HOLD the planner resumes following by itself until
+``resume_timeout``; after that the state remains, and the planner sends no command until it is
+engaged again. No function reads a clock.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
 
     :param fault: fault of the ego odometry or of perception, or ''.
     :param youngest: age of the youngest estimate of a neighbor in sight, s, or None.
-    :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
-    :param waiting: reason why it may not command yet, or why it was disengaged, or ''.
+    :param followed: age of the newest estimate that was followed since IDLE, s, or None.
+    :param waiting: reason why the planner may not command, or why it was disengaged, or ''.
     :param given_up: whether it had no neighbor for too long, and must be engaged again.
     :param received: age of the youngest estimate reported by another vehicle, s, or None.
     :param occluded: whether the faced neighbor is occluded.
@@ -105,18 +105,18 @@ OVERDUE_FACTOR = 1.2  # factor on the greatest age that the last messages reache
 
 def odometry_delay(own: OwnState | None, now: float, params: PlannerParams) -> str:
     """
-    Return that odometry is late, or that its source is too slow, or ''.
+    Return the reason if odometry is late, or its source is too slow, or ''.
 
     Between two messages the age of odometry grows: at 10 Hz and 60 ms of latency it is 0.16 s
-    old just before the next message arrives. A fast source is late at ``NEVER_LATE_SHARE`` of the
-    timeout, a slow one if its message becomes older than the last ones did.
+    just before the next message arrives. A fast source is late at ``NEVER_LATE_SHARE`` of the
+    timeout, a slow source if its message becomes older than the last messages did.
     """
     if own is None:
         return ''
     age, latest = now - own.stamp, ALWAYS_LATE_SHARE * params.odom_timeout
     usual = sorted(own.ages)[len(own.ages) // 2] if own.ages else 0.0
     if usual > latest:
-        return f'odometry too slow ({usual:.2f} s old before the next comes)'
+        return f'odometry too slow ({usual:.2f} s old when the next message arrives)'
     longest = max(NEVER_LATE_SHARE * params.odom_timeout,
                   OVERDUE_FACTOR * max(own.ages, default=0.0))
     return f'odometry late ({age:.2f} s)' if age > min(longest, latest) else ''

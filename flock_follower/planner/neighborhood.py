@@ -15,17 +15,19 @@
 """
 Neighbor selection: which neighbors the vehicle follows, faces and only keeps clear of.
 
-The nominal command is that of the law for the neighbors selected. Edges are those of
-``flock.neighbor_graph``; neighbors to avoid are no part of it. All distances are between hulls.
+The nominal command is the law's command for the selected neighbors. Edges are those of
+``flock.neighbor_graph``; this graph does not contain neighbors to avoid. All distances are between
+hulls.
 
-A leader that left the view is searched for while the positions of other neighbors are still
-received: only the vehicle's own camera can find a leader without a radio. The vehicle that saw
-it last looks where it was, to both sides, then all round. Meanwhile it follows the others by
-their messages, and keeps clear of where the leader may be as it would alone. Otherwise the
-vehicle would turn to another follower, and the whole flock would hover without its leader.
+If a leader has left the view, the vehicle that saw it last searches for it, even while the
+positions of other neighbors are received, because only a camera can find a leader without a radio.
+The vehicle turns to the last place of the leader, to both sides, then all round. Meanwhile it
+follows the other neighbors by their messages, and keeps clear of the places where the leader may
+be. Without this search the vehicle would turn to another follower, and the whole flock would hover
+without its leader.
 
-Warnings name neighbors that the follower cannot follow, and vehicles of the neighbors' file whose
-position is unknown.
+Warnings name neighbors that cannot be followed, and vehicles of the neighbors' file whose position
+is unknown.
 """
 
 from __future__ import annotations
@@ -49,19 +51,19 @@ GAP_MIN = 1e-3  # m: least distance of hulls for the law, if they touch or overl
 
 
 class Neighborhood(NamedTuple):
-    """The neighbors in use, all at one time, and their relations to the ego vehicle."""
+    """The known neighbors, all at one time, and their relations to the ego vehicle."""
 
     flock: Sequence[Neighbor]
     shares: Mapping[str, float]
-    """From 0 for none to 1 for an edge: each changes over the time of a handover."""
+    """1 with an edge, 0 without; in between while an edge fades in or out."""
     edges: frozenset[str]
-    """Names of the neighbors with an edge; from the others the vehicle only keeps clear."""
+    """Names of the neighbors with an edge; the vehicle only keeps clear of the others."""
     faced: Neighbor | None
     """The neighbor that the vehicle faces and keeps in sight."""
     level: Neighbor | None
     """The neighbor whose altitude the vehicle follows; None: the altitude is held."""
     distances: Mapping[str, float]
-    """Between the centers, m."""
+    """Distances between the centers, m."""
 
     def clearance(self, n: Neighbor, params: PlannerParams) -> float:
         """Return the distance between the ego hull and a neighbor's, m."""
@@ -81,8 +83,8 @@ def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
     """
     Return the relations of the present neighbors to this vehicle.
 
-    :param memory: with the relations of the step before, ``elapsed`` seconds ago.
-    :param flock: all neighbors at hand, at one time; at least one of them can be followed.
+    :param memory: has the relations of the previous step, ``elapsed`` seconds ago.
+    :param flock: all present neighbors, at one time; at least one of them can be followed.
     """
     here = me.position.tolist()
     distances = {n.name: math.dist(n.position.tolist(), here) for n in flock}
@@ -114,7 +116,7 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     """
     Return the names of the neighbors with an edge to this vehicle.
 
-    :param held: those of the step before.
+    :param held: the edges of the previous step.
     """
     follow = [n for n in flock if n.member.role != AVOID]
     if len(follow) < 2:
@@ -167,8 +169,8 @@ def lost_leader(memory: Memory, neighbors: Neighborhood, me: OwnState,
     """
     Return the last estimate of a lost leader to search for, at most ``resume_timeout`` old.
 
-    The search begins if no neighbor is in view: a vehicle that has another one in view stays with
-    that. The search ends when a leader is at hand again.
+    The search begins if no neighbor is in view: otherwise the vehicle stays with the neighbor in
+    view. The search ends when a leader is present again.
     """
     last = memory.leader
     if last is None or any(n.member.role == LEADER for n in neighbors.flock):
@@ -191,8 +193,9 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     """
     Return the acceleration (3,), m/s^2, without limits, and the fade-in to that of the law.
 
-    In TRACK it is that of the law, or of the fade-in; in COAST zero; else it brakes to a hover. If
-    odometry jumped while a neighbor came, it retreats until it sees one.
+    In TRACK it is the acceleration of the law, or of the fade-in; in COAST zero; otherwise it
+    brakes to a hover. If odometry jumped while a neighbor approached, it retreats until a neighbor
+    is in sight.
 
     :param velocity: ego velocity when the command acts (3,), m/s.
     """

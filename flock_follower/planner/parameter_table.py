@@ -51,8 +51,9 @@ def planner_params(values: Mapping[str, Any], name: str = '') -> PlannerParams:
     Return the parameters of the planner's core.
 
     :param name: of this vehicle; the neighbors' file may contain it, too.
-    :raises ValueError: if they do not fit together, cannot fly, or the neighbors' file is wrong.
-    :raises OSError: if it cannot be read.
+    :raises ValueError: if the parameters contradict each other or cannot fly, or the neighbors'
+        file is wrong.
+    :raises OSError: if the file cannot be read.
     """
     cameras(values)
     params = filled(PlannerParams(), values, vehicles={

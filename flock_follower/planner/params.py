@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the planner, and the properties of each vehicle that are known beforehand."""
+"""The parameters of the planner, and the properties of vehicles known before the flight."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ SEEN_DEFAULT, RECEIVED_DEFAULT = Member(LEADER), Member(FOLLOWER)  # strangers
 
 def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     """
-    Return the role and size of a vehicle; an unlisted one's role depends on its detection.
+    Return role and size of a vehicle; if it is not listed, its role depends on its detection.
 
     A duplicate of a neighbor's marker is avoided, with the neighbor's radius.
     """
@@ -98,11 +98,11 @@ class GuardParams(Checked):
 
     def closing_speed(self, gap: float, b: float | None = None) -> tuple[float, float]:
         """
-        Return S, m/s, and its slope S', 1/s, for a gap, m, to the margin of an edge.
+        Return the speed S, m/s, and its slope S', 1/s, for a gap, m, to the margin of an edge.
 
         S is negative beyond the margin.
 
-        :param b: deceleration, m/s^2, if it is not that of the parameters.
+        :param b: deceleration, m/s^2; by default that of the parameters.
         """
         if gap < 0.0:
             returning = gap > -EDGE_RETURN_SPEED * self.tau
@@ -120,13 +120,13 @@ class Edges(NamedTuple):
     margin: float = 0.0
     """Margin to each edge, m."""
     spread: float = 0.0
-    """Largest distance from its expected position, m ..."""
+    """Largest distance of the neighbor from its expected position, m."""
     spreading: float = 0.0
-    """... and its growth rate, m/s."""
+    """Growth rate of ``spread``, m/s."""
     headway: float = 0.0
-    """Headway, s: time for which there is space at the ego speed towards the neighbor, plus ..."""
+    """Headway, s: time for which the near edge leaves space at the closing speed."""
     fastest: float = 0.0
-    """... this speed of the neighbor towards the vehicle, m/s."""
+    """Speed of the neighbor towards the vehicle that the headway assumes, m/s."""
 
     @classmethod
     def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
@@ -276,7 +276,7 @@ class PlannerParams(Checked):
 
     @property
     def climb_rate(self) -> float:
-        """Return the largest vertical speed, m/s; it leaves a part of v_max for level motion."""
+        """Return the largest vertical speed, m/s; a part of v_max is left for level motion."""
         return min(self.climb_rate_max, CLIMB_SHARE * self.v_max)
 
     def __post_init__(self) -> None:

@@ -15,12 +15,12 @@
 """
 The best point of a plane within two discs and linear bounds.
 
-The bounds are taken one after the other (Seidel, "Small-dimensional linear programming and convex
-hulls made easy", Discrete & Computational Geometry 6, 1991, here with discs and distances): while
-the best point for those before keeps a bound, it stays the best. Otherwise the best point lies on
-the bound's line, since the set is convex: it is the best of an interval of that line. If the line
-holds no such point, this is the first bound for which those before leave no room. m bounds cost at
-most m^2 steps, and as a rule a few m.
+The bounds are added one after the other (Seidel, "Small-dimensional linear programming and convex
+hulls made easy", Discrete & Computational Geometry 6, 1991, here with discs and distances). If the
+best point so far keeps the next bound, it remains the best point. Otherwise the best point lies on
+the line of this bound, because the set is convex: it is the best point of an interval of the line.
+If the interval is empty, the bounds before leave no room for this bound. m bounds need at most m^2
+steps, usually a few m.
 
 Points are complex numbers: small arrays would take ten times as long.
 """
@@ -46,7 +46,7 @@ def product(one: complex, other: complex) -> float:
 
 
 class Discs(NamedTuple):
-    """All points in both of two discs; they must have one in common."""
+    """The points in both of two discs; there must be at least one."""
 
     center: complex
     radius: float
@@ -57,7 +57,8 @@ class Discs(NamedTuple):
         """
         Return the point that is nearest to a place.
 
-        :param far: the goal is a direction, not zero: return the point that is farthest in it.
+        :param far: whether the goal is a direction, not zero; then return the point that is
+            farthest in this direction.
         """
         center, radius, other, other_radius = self
         if not far and (abs(goal - center) <= radius + LENGTH_TOLERANCE
@@ -156,7 +157,8 @@ def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tu
     """
     Return the best point within as many of the first bounds as leave room, and how many.
 
-    :param goal: the place to be nearest to, or if ``far`` the direction to be farthest in.
+    :param goal: the point is the nearest to this place; if ``far``, the farthest in this
+        direction.
     """
     point = discs.best(goal, far and goal != 0.0)
     for k, (normal, least) in enumerate(sides):
@@ -172,8 +174,8 @@ def nearest_in_order(goal: complex, sides: Sequence[Side], discs: Discs) -> comp
     """
     Return the point of the discs nearest to ``goal`` within the bounds, in order of priority.
 
-    If the bounds before one leave no room for it, it is met as nearly as they allow: no bound
-    relaxes one before it. A bound whose normal is zero is ignored.
+    If the bounds before leave no room for a bound, it is met as nearly as they permit: no bound
+    relaxes a bound before it. A bound whose normal is zero is ignored.
     """
     sides = [(normal, min(max(least, -_HUGE), _HUGE)) for normal, least in sides if normal]
     point, k = optimum(goal, False, sides, discs)

@@ -15,15 +15,15 @@
 """
 Control without odometry: controls distance and relative velocity to the leader by the marker.
 
-Own motion is then the autopilot's attitude and the accelerations flown, integrated; its velocity
-drifts. The leader's estimate has the same drift, so distance and relative velocity have none. Only
-these two are used. The speed over the ground is neither known nor bounded.
+The ego motion is then integrated from the autopilot's attitude and the flown accelerations; its
+velocity drifts. The leader's estimate has the same drift, so distance and relative velocity have
+no drift. Only these two are used. The speed over the ground is neither known nor limited.
 
-The follower is led to the middle of the law's band by a relative velocity, which is bounded, and
-reached with the time constant VELOCITY_TIME. So all relative motion is damped; the common motion
-of both is the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer
-offsets the relative acceleration that was not commanded: the error of the tilt, which accelerates
-the follower, and the leader's own. Other neighbors in sight bound the approach.
+A relative velocity, which is limited, and reached with the time constant VELOCITY_TIME, leads the
+follower to the middle of the law's band. So all relative motion is damped; the common motion is
+that of the leader (relative data cannot damp more: SWA, arXiv 2508.16460). An observer offsets the
+relative acceleration that was not commanded: that by the tilt error of the follower, and that of
+the leader. Other neighbors in sight limit the approach.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ class Disturbance(NamedTuple):
     """
 
     velocity: Array | None = None
-    """Relative velocity, estimated (3,), m/s."""
+    """Estimated relative velocity (3,), m/s."""
     response: Array = np.zeros(3)
-    """Acceleration commanded, as far as it is flown (3,), m/s^2."""
+    """The part of the commanded acceleration (3,), m/s^2, that is flown already."""
     acceleration: Array = np.zeros(3)
-    """(3,), m/s^2."""
+    """Estimated disturbance (3,), m/s^2."""
 
     def update(self, velocity: Array, command: Array | None, elapsed: float,
                response_time: float) -> Disturbance:
@@ -154,9 +154,9 @@ def level_command(me: OwnState, coming: Array, leader: Neighbor, others: Sequenc
     """
     Return the horizontal acceleration (2,), m/s^2, without limits.
 
-    :param me: ego state, now; :param coming: velocity commanded and not flown yet (3,), m/s.
-    :param leader: the neighbor to follow, by its newest estimate, at its stamp.
-    :param others: likewise, those to keep clear of.
+    :param me: ego state, now; :param coming: velocity commanded, but not flown yet (3,), m/s.
+    :param leader: the newest estimate of the neighbor to follow, at its stamp.
+    :param others: the newest estimates of the neighbors to keep clear of.
     """
     law, age = params.law, me.stamp - leader.stamp
     a = [0.0, 0.0, 0.0] if leader.acceleration is None else leader.acceleration.tolist()
@@ -190,7 +190,7 @@ def limit_relative(horizontal: Array, vertical: float, last: Array | None) -> Ar
     """
     Return the acceleration (3,), m/s^2: within the limit, the vertical first, and without steps.
 
-    :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
+    :param last: acceleration of the previous tick (3,), m/s^2; None if there was none.
     """
     up = min(max(vertical, -RELATIVE_ACCELERATION_MAX), RELATIVE_ACCELERATION_MAX)
     flat = limit_norm(horizontal, math.sqrt(RELATIVE_ACCELERATION_MAX ** 2 - up * up))

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-How far, how fast and how high the follower gets out of the way of a neighbor that it cannot see.
+How far, how fast and how high the follower moves away from a neighbor that it cannot see.
 
-Out of sight the guard's bounds move it, at most by ``retreat``; an approaching neighbor may pass
-below, by ``overflight``. If odometry is lost there are no commands: the gate brakes to
-``fallback_retreat``. Nothing here reads a clock.
+While a neighbor is out of sight, the guard's bounds move the follower by at most ``retreat``, and
+``overflight`` lets an approaching neighbor pass below. If odometry is lost, there are no commands:
+the gate brakes to ``fallback_retreat``. No function reads a clock.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     """
     Return the largest retreat from a neighbor out of sight, m.
 
-    A leader is no faster than ``v_max``: the slower the vehicle may be, the shorter it retreats.
-    One that was lost above is out of view until it comes down, on the vehicle if that stayed: the
-    retreat from it has no such limit. The retreat is shorter by the distance beyond the band at
-    the loss, too.
+    A leader is assumed to be no faster than ``v_max``: so the retreat is shorter for a small
+    ``v_max``. A leader that was lost above the vehicle is out of view until it comes down,
+    possibly on the vehicle: for this leader, the retreat does not depend on ``v_max``. If the
+    leader was lost beyond the band, the retreat is shorter by the distance beyond the band.
     """
     distance = lost.free - float(lost.towards @ lost.origin)
     beyond = max(distance - math.sqrt(params.law.d1), 0.0)
@@ -77,12 +77,12 @@ def _longest_retreat(approach: float, params: PlannerParams, known: float = math
 
 
 class FallbackRetreat(NamedTuple):
-    """What to do if odometry is lost now."""
+    """The retreat that begins if odometry is lost now."""
 
     velocity: Array
     """Velocity (3,), m/s, to brake to."""
     approach: float
-    """Speed, m/s, with which the neighbor may come meanwhile."""
+    """Speed, m/s, at which the neighbor may approach meanwhile."""
 
 
 def fallback_retreat(memory: Memory, scene: Scene,
@@ -90,10 +90,10 @@ def fallback_retreat(memory: Memory, scene: Scene,
     """
     Return the retreat that keeps the distance to a neighbor while odometry is lost, or None.
 
-    The retreat is from the nearest neighbor that approaches, or will in TRUSTED_TIME. One that
-    has begun to accelerate towards the vehicle counts, too, if it would come nearer than the
-    margin within ODOMETRY_GAP: see ``turned_path``. The retreat from it is as fast as that
-    requires. Its length is limited like that of a retreat out of sight.
+    The retreat is from the nearest neighbor that approaches, or will approach within TRUSTED_TIME.
+    A neighbor that has begun to accelerate towards the vehicle also counts, if it would come
+    nearer than the margin within ODOMETRY_GAP, see ``turned_path``; the speed of the retreat then
+    keeps the margin. The length of the retreat is limited as for a neighbor out of sight.
     """
     if not params.guard or params.retreat_max == 0.0:
         return None
@@ -138,9 +138,9 @@ def turned_path(approach: float, params: PlannerParams) -> float:
     """
     Return by how much a neighbor that turns may be nearer after ODOMETRY_GAP, m.
 
-    It accelerates towards the vehicle by ``leader_acceleration_max``, up to ``v_max``.
+    The neighbor accelerates towards the vehicle by ``leader_acceleration_max``, up to ``v_max``.
 
-    :param approach: its speed towards the vehicle now, m/s; negative if it goes away.
+    :param approach: its speed towards the vehicle now, m/s; negative if it flies away.
     """
     most = params.leader_acceleration_max
     lasting = min(max(params.fastest - approach, 0.0) / most, ODOMETRY_GAP) if most > 0.0 else 0.0
@@ -151,8 +151,8 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     """
     Return the least height, m, at which an approaching neighbor out of sight may pass below.
 
-    Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
-    of ``altitude_max`` is no ceiling.
+    Without a ceiling (the default of ``altitude_max``), or with a ``retreat_max`` of 0, the result
+    is -inf.
 
     :param held: altitude to hold, m.
     """

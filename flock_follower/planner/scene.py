@@ -15,7 +15,7 @@
 """
 The scene of one step, and the decision that the step makes.
 
-The scene is the ego state, the neighbors at hand, and those lost that may still be near.
+The scene is the ego state, the present neighbors, and lost neighbors that may still be near.
 
 ``survey`` also updates the memory: the neighbors to keep clear of, their motions, and the loss of
 sight of the neighbor that the vehicle followed.
@@ -65,13 +65,13 @@ class Decision(NamedTuple):
     yaw: float | None = None
     """Commanded yaw, rad, ENU; None exactly if the acceleration is None."""
     yaw_rate: float = 0.0
-    """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
+    """Rate, rad/s, ENU, that turns the vehicle to the commanded yaw, and with this yaw."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
+    """Unit vector (3,) away from the neighbor to keep clear of; None without one."""
     retreat: Array | None = None
     """Velocity (3,), m/s, to brake to if odometry is lost; None: brake to a hover."""
     stamp: float | None = None
-    """Stamp of the newest estimate that the command is based on, s; None without one."""
+    """Stamp of the newest estimate on which the command is based, s; None without one."""
     limits: str = ''
     """The active limits: of 'a_max', 'v_max' and the reasons of the guard's bounds."""
     rejected: tuple[Rejection, ...] = ()
@@ -80,7 +80,7 @@ class Decision(NamedTuple):
     altitude: float = math.nan
     """The commanded altitude, m; NaN without one."""
     edges: tuple[str, ...] = ()
-    """The neighbors at the ends of its edges; others are only kept clear of."""
+    """The neighbors with an edge; the vehicle only keeps clear of others."""
 
 
 class Scene(NamedTuple):
@@ -88,15 +88,15 @@ class Scene(NamedTuple):
 
     state: State
     me: OwnState
-    """Own state, predicted to now."""
+    """Ego state, predicted to now."""
     blinded: bool
     """Whether no images are processed."""
     neighbors: Neighborhood
-    """The neighbors at hand in TRACK, else none."""
+    """The present neighbors in TRACK; otherwise empty."""
     leader: Neighbor | None
     """Last estimate of a lost leader to search for while others are followed."""
     missed: Neighbor | None
-    """The lost neighbor: ``leader``, or if none is followed the neighbor that was lost last."""
+    """The lost neighbor: ``leader``, or the last one lost if no neighbor is followed."""
     predictions: Mapping[str, Prediction]
     """Predictions of the neighbors to keep clear of, by name."""
 
@@ -151,13 +151,13 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
 
 
 def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
-    """Return whether a received follower has fallen silent: it may have failed."""
+    """Return whether a received follower has become silent, so that it may have failed."""
     return (n.received and n.member.role == FOLLOWER
             and now - n.stamp > params.heard_timeout)
 
 
 def expected_now(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
-    """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
+    """Return a lost neighbor at its expected place, predicted by at most ``coast_timeout``."""
     age = min(now - n.stamp, params.coast_timeout)
     it = predict(n, memory.acceleration(n), age, params)
     return n._replace(stamp=n.stamp + age, position=np.array(it.position),

@@ -15,9 +15,9 @@
 """
 Field of view of the cameras, and occlusion of the faced neighbor: its marker should be visible.
 
-A marker that leaves the image is expected to come back, and the follower coasts. A marker that is
-predicted well inside the image and is not found is covered by an obstacle in the follower's way,
-so the follower brakes. Nothing here reads a clock.
+If a marker leaves the image, it is expected to come back, and the follower coasts. If a marker is
+predicted well inside the image and is not found, an obstacle in the follower's way covers it, and
+the follower brakes. No function reads a clock.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class FieldOfView(NamedTuple):
 
         :param info: its CameraInfo.
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
-        :param several: it is one of several, which may look to any side.
-        :param rectified: its images are undistorted already: P is that of a pinhole camera.
+        :param several: whether there are several cameras, which may look to any side.
+        :param rectified: whether its images are undistorted already, so that P is used.
         :raises ValueError: if it looks neither ahead nor to a side, or K or P is invalid.
         """
         angles, width, height = np.asarray(rpy, dtype=float).tolist(), info.width, info.height
@@ -121,7 +121,7 @@ def visible(view: FieldsOfView, offset: Array, yaw: float, forward: float, margi
 
 def vertical(view: FieldsOfView, bearing: float) -> tuple[float, float]:
     """
-    Return the largest angles up and down, rad, of the images nearest to a bearing.
+    Return the largest angles up and down, rad, in the images that are nearest to a bearing.
 
     :param bearing: from the forward axis, rad.
     """
@@ -145,15 +145,15 @@ class Occlusion(NamedTuple):
     """A neighbor is missing in consecutive images that should show it."""
 
     lost: float
-    """Stamp of the last estimate before, s."""
+    """Stamp of the last estimate before the occlusion, s."""
     found: float = math.inf
-    """Stamp of the first of the consecutive estimates that may end it, s."""
+    """Stamp of the first of the estimates that may end the occlusion, s."""
 
 
 def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
               frames: Sequence[float], view: FieldsOfView, forward: float) -> Occlusion | None:
     """
-    Return the occlusion of a neighbor, whatever hides it; None if it is not occluded.
+    Return the occlusion of a neighbor by any object; None if it is not occluded.
 
     :param before: the occlusion in the last step.
     :param n: its newest estimate; None if there is none.

@@ -15,10 +15,10 @@
 """
 One step of the planner: from the newest estimates to one safe acceleration.
 
-The states are those of :mod:`flock_follower.planner.modes`. Leaving IDLE begins a new flight with
-the present altitude and yaw: nothing of an earlier flight remains. When following begins, begins
-again, or continues with other parameters, the command of the law is faded in; the guard acts on
-the result at once. Nothing here reads a clock: equal inputs give equal outputs.
+The states are those of :mod:`flock_follower.planner.modes`. When the state leaves IDLE, a new
+flight begins with the present altitude and yaw, without data of an earlier flight. When following
+begins, begins again, or continues with changed parameters, the law's command is faded in; the
+guard acts at once. No function reads a clock: equal inputs give equal outputs.
 
 The order of the bounds on a command is that of :mod:`flock_follower.planner.guard`, within
 ``a_max`` and ``v_max``. Altitude has priority over all horizontal motion.
@@ -57,13 +57,13 @@ class Inputs(NamedTuple):
     own: OwnState | None
     """The newest odometry, or None."""
     estimates: Sequence[Neighbor]
-    """Of neighbors since the last step; the newest of each name counts."""
+    """Estimates of neighbors since the last step; the newest of each name counts."""
     looked: float | None = None
-    """Time at which the last image was processed, s; None if none was: that is no fault."""
+    """Time of the last processed image, s; None before the first, which is no fault."""
     waiting: str = ''
-    """Reason why it may not command, or why it was disengaged, or ''."""
+    """Reason why the planner may not command, or why it was disengaged, or ''."""
     view: FieldsOfView = ()
-    """Of the cameras; () if unknown."""
+    """Fields of view of the cameras; () if unknown."""
     ground: float | None = None
     """Height at arming, m, in odom."""
     frames: Sequence[float] = ()

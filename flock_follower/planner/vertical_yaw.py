@@ -15,17 +15,18 @@
 """
 Altitude and yaw control: the altitude to hold, the vertical acceleration and the yaw.
 
-The altitude to hold follows that of the nearest neighbor, because a camera that looks ahead
-loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
-(s + w)^2, critically damped. The gate offsets an error of the hover thrust.
+The altitude to hold follows the altitude of the nearest neighbor, because a camera that looks
+ahead loses a neighbor that climbs or descends. The altitude control has the characteristic
+polynomial (s + w)^2, critically damped. The gate offsets an error of the hover thrust.
 
 The vehicle stops at the lowest and at the highest altitude: its vertical speed is limited by the
-distance to them at the time a command acts. To limit only the target altitude is not enough: the
-vehicle overshot by 0.25 m, because of the target's climb and of commands not yet flown.
+distance to them at the time when a command acts. With a limit on the target altitude only, the
+vehicle overshot by 0.25 m, because of the target's climb and of commands not flown yet.
 
-The neighbor's vertical velocity is smoothed, without lag if its acceleration is known. A
-velocity v as small as its noise counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, as
-after a loss, is reduced slowly: with the delay of the vehicle, a fast climb overshoots ``v_max``.
+The neighbor's vertical velocity is smoothed, without lag if its acceleration is known. A small
+velocity v, similar to the noise, counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, for
+example after a loss, is reduced slowly: because of the vehicle's delay, a fast climb would exceed
+``v_max``.
 
 The yaw turns the camera to the neighbor, or turns round to search for it.
 """
@@ -54,21 +55,21 @@ class Altitude(NamedTuple):
     """The altitude to hold, m, and the state of its control, between one step and the next."""
 
     held: float
-    """m."""
+    """Altitude to hold, m."""
     lowest: float
-    """m; the vehicle is lower only if the flight began lower."""
+    """Lowest altitude, m; the vehicle is lower only if the flight began lower."""
     highest: float
-    """m."""
+    """Highest altitude, m."""
     climb: float = 0.0
     """Rate of ``held``, m/s."""
     commanded: float = math.nan
-    """The altitude that the command leads to, m; NaN while neighbors limit the climb."""
+    """The altitude to which the command leads, m; NaN while neighbors limit the climb."""
     neighbor_climb: float | None = None
-    """Vertical velocity of the neighbor that is followed, m/s; None without one."""
+    """Vertical velocity of the followed neighbor, m/s; None without one."""
     ground: float | None = None
     """Height at which the vehicle was armed, m; None if unknown."""
     limits: tuple[float, float] | None = None
-    """``altitude_min`` and ``altitude_max`` that the bounds are of, m."""
+    """``altitude_min`` and ``altitude_max`` that give the bounds, m."""
 
     @classmethod
     def begin(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
@@ -90,7 +91,7 @@ class Altitude(NamedTuple):
                         limits=self.limits)
 
     def with_limits_of(self, params: PlannerParams) -> Altitude:
-        """Return it with the bounds of parameters that have changed in flight."""
+        """Return the altitude with the bounds of parameters that have changed in flight."""
         limits = params.altitude_min, params.altitude_max
         if self.limits is None or limits == self.limits:
             return self
@@ -137,10 +138,10 @@ class Altitude(NamedTuple):
         """
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
-        :param least: vertical speed, m/s, that neighbors permit; :param most: largest one. The
-            lowest and the highest altitude have priority.
-        :param coming: vertical velocity, m/s, that is commanded and not yet flown.
-        :param raised: altitude, m, at least to hold now, without a change of ``held``.
+        :param least: least vertical speed, m/s, that neighbors permit; :param most: the largest.
+            The lowest and the highest altitude have priority.
+        :param coming: vertical velocity, m/s, that is commanded, but not flown yet.
+        :param raised: least altitude to hold now, m; it does not change ``held``.
         """
         w = params.altitude_frequency
         strongest = min(params.max_vertical_acceleration, params.a_max)
@@ -194,7 +195,7 @@ LOOK_THERE = 0.5  # s for which the vehicle faces that place first
 
 def face_yaw(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
              elapsed: float) -> float:
-    """Return the yaw after a turn from the last yaw towards a neighbor's predicted place."""
+    """Return the next yaw on the way from the last yaw to a neighbor's predicted place."""
     x, y, _ = (neighbor.position - me.position).tolist()
     distance = math.hypot(x, y)
     if distance < OVERHEAD_DISTANCE:
@@ -212,7 +213,7 @@ def search_yaw(last: float, me: OwnState, there: Neighbor, since: float, params:
 
     The first side is the one to which the neighbor moved.
 
-    :param there: the neighbor where it is expected; :param since: time of the search, s.
+    :param there: the neighbor at its expected place; :param since: duration of the search, s.
     """
     x, y, _ = there.position - me.position
     left = params.scan_rate * max(since - LOOK_THERE, 0.0)
@@ -229,8 +230,8 @@ def turn_rate(before: float, commanded: float, me: OwnState, params: PlannerPara
     """
     Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
 
-    That is the rate of the commanded yaw, plus a correction towards that yaw: an autopilot that
-    receives a rate does not control the yaw itself.
+    The rate is that of the commanded yaw, plus a correction towards this yaw, because an autopilot
+    that receives a rate does not control the yaw itself.
 
     :param before: the yaw commanded ``elapsed`` seconds ago, rad; ``commanded`` now.
     """

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a browser sees of a flight: state, scene, picture, and who may see it. No ROS here."""
+"""The live page of a flight: state, scene, picture, access. No ROS here."""

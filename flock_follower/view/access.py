@@ -15,10 +15,10 @@
 """
 Who may see the live page, and who may press its buttons.
 
-A page that is open in the same browser can send requests here: from another origin, or, after its
-name was made to resolve to this machine (DNS rebinding), under a foreign host name. So the host
-of each request and the origin of each WebSocket are checked. Whoever can reach the address can
-read on loopback; beyond loopback, and for the buttons, a token is needed.
+A foreign page that is open in the same browser can send requests to this server: from another
+origin, or under a foreign host name that resolves to this machine (DNS rebinding). So the host of
+each request and the origin of each WebSocket are checked. On loopback everyone who can reach the
+address can read; beyond loopback, and for the buttons, a token is required.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TOKEN_BYTES: Final = 16
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host is reached from this machine alone; of names only localhost is."""
+    """Return whether only this machine can reach a host; the only such name is localhost."""
     if host == 'localhost':
         return True
     try:
@@ -62,11 +62,11 @@ class Access:
     """
     The rules of one page.
 
-    :param host: the address it is bound to.
-    :param control: whether it has buttons.
+    :param host: the address of the server.
+    :param control: whether the page has buttons.
     :param token: '' if there is none.
-    :param names: host names of this machine; a numeric address needs no entry, because no
-        foreign name hides behind it.
+    :param names: host names of this machine; numeric addresses are always accepted, because
+        they are no foreign names.
     :raises ValueError: without a token if one is needed.
     """
 
@@ -86,17 +86,17 @@ class Access:
 
     @property
     def needs_token(self) -> bool:
-        """Return whether anything needs a token."""
+        """Return whether reading or the buttons need a token."""
         return self.control or not self.open_to_readers
 
     def matches(self, offered: str) -> bool:
-        """Return whether an offered token is the right one; in constant time."""
+        """Return whether a token is right; the comparison takes constant time."""
         # Bytes that are no UTF-8 come as surrogates, which encode() alone refuses.
         return bool(self.token) and hmac.compare_digest(
             offered.encode(errors='surrogatepass'), self.token.encode())
 
     def refuse_host(self, header: str) -> str:
-        """Return ``HOST`` if the Host header of a request names no address of ours; or ''."""
+        """Return ``HOST`` if the Host header of a request names none of our addresses; or ''."""
         host = split_host(header)
         try:
             ip_address(host)
@@ -130,7 +130,7 @@ class Access:
         return self.refuse_reader(header, offered)
 
     def refuse_button(self, offered: str) -> str:
-        """Return why a button that was pressed does nothing, or ''."""
+        """Return why a pressed button is refused, or ''."""
         if not self.control:
             return OFF
         return '' if self.matches(offered) else TOKEN

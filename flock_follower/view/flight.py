@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The newest of every message of a flight, with its age; what a page shows of it.
+The newest messages of a flight with their ages, and the page that shows them.
 
-Times are s on a monotonic clock. A source that is silent for longer than its limit is stale, and
-its last value is shown as such: a latched state outlives its node.
+Times are s on a monotonic clock. If a source is silent for longer than its limit, its last value
+is shown as stale, because a latched state remains after its node has ended.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class ShownBattery(NamedTuple):
 
 
 class ShownFlight:
-    """Takes messages, and returns pages; not to be shared by threads."""
+    """Takes messages, and returns pages; only one thread may use it."""
 
     def __init__(self) -> None:
         self.own: OdometryState | None = None
@@ -107,7 +107,7 @@ class ShownFlight:
     # Messages.
 
     def note(self, source: str, now: float) -> None:
-        """Note that a source, a key of ``LIMITS``, has sent something."""
+        """Record that a source, a key of ``LIMITS``, has sent a message."""
         self._times[source] = now
 
     def take_odometry(self, state: OdometryState, now: float) -> bool:
@@ -185,7 +185,7 @@ class ShownFlight:
         return not self.age(source, now) <= LIMITS[source]
 
     def planner_values(self, now: float) -> Mapping[str, str]:
-        """Return the planner's values on /diagnostics; none of a planner that is silent."""
+        """Return the planner's values on /diagnostics; empty if the planner is silent."""
         return {} if self.stale('planner', now) else self._reports['planner'].values
 
     def planner_state(self, now: float) -> tuple[str, str]:
@@ -208,7 +208,8 @@ class ShownFlight:
         """
         Return the neighbors as they were estimated at the stamp of an image, ns.
 
-        An estimate of another image is carried on by its velocity; the age is that between both.
+        An estimate of another image is extrapolated with its velocity; the age is the time between
+        both.
         """
         found = []
         for states in self._neighbors.values():
@@ -233,7 +234,7 @@ class ShownFlight:
         return draw(None, self.neighbors_at(stamp), None, {})
 
     def page(self, now: float) -> dict[str, Any]:
-        """Return what a page shows now; numbers that are unknown are None."""
+        """Return the content of the page; unknown numbers are None."""
         self._forget(now)
         planner, bridge = self.planner_values(now), self._reports.get('mavlink_bridge')
         state, reason = self.planner_state(now)
@@ -309,7 +310,7 @@ class ShownFlight:
 
 
 def from_above(shape: Shape) -> dict[str, Any]:
-    """Return a shape as seen from above: name, kind, paint, points (n, 2), m, yaw, width, text."""
+    """Return a shape from above: name, kind, paint, points (n, 2), m, yaw, width, text."""
     center = np.asarray(shape.position, float)
     rotation = quaternion_to_matrix(shape.quaternion)
     points = np.asarray(shape.points, float).reshape(-1, 3)[:, :2]
@@ -342,7 +343,7 @@ def pose(state: Any) -> Transform:
 
 
 def clean(value: Any) -> Any:
-    """Return a value for JSON: no number but finite ones, no text too long to show."""
+    """Return a value for JSON: with finite numbers only, and with shortened texts."""
     if isinstance(value, dict):
         return {str(key)[:LONGEST_TEXT]: clean(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -15,9 +15,9 @@
 """
 A flight as shapes in the frame of the odometry: for RViz, Foxglove, and the live page.
 
-The follower with its state and command; each neighbor with its velocity, the ellipsoid of its
-position, and the planner's band about it. ``visualizer`` publishes the shapes, and the page draws
-the same ones from above and into the image.
+The shapes are the follower with its state and command, and each neighbor with its velocity, the
+ellipsoid of its position, and the planner's band about it. ``visualizer`` publishes the shapes;
+the page draws the same shapes from above and into the image.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def draw(own: OdometryState | None, neighbors: Iterable[tuple[OdometryState, flo
     Return the shapes of a flight.
 
     :param neighbors: each with the time since it was seen, s.
-    :param command: the newest one with its age, s.
-    :param report: the planner's newest values on ``/diagnostics``; empty if there is none.
+    :param command: the newest command with its age, s.
+    :param report: the planner's newest values on ``/diagnostics``; empty if there are none.
     """
     shapes: list[Shape] = []
     for state, age in neighbors:

@@ -15,10 +15,10 @@
 """
 The server of the live page: aiohttp in a thread of its own.
 
-Each page has room for one state and one image that wait: a slow browser gets fewer of them, and
-neither it nor ten pages hold up anything else. A connection that is no open page ends in time,
-whatever it sends, reads or leaves unread: without a limit clients use up the sockets of the
-process. The methods of :class:`PageServer` may be called from any thread.
+For each page at most one state and one image wait, so a slow browser gets fewer of them, and
+neither a slow browser nor ten pages delay other work. Every connection that is not an open page is
+closed after a time, because clients could use up the sockets of the process. The methods of
+:class:`PageServer` may be called from any thread.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _Page:
                  connection: asyncio.BaseProtocol) -> None:
         self.token, self.socket, self.connection = token, socket, connection
         self.greeted = False
-        """Whether it has got the history."""
+        """Whether the page has received the history."""
         self.state: str | None = None
         self.image: bytes | None = None
         self.answers: deque[str] = deque(maxlen=ANSWERS_MAX)
@@ -94,7 +94,7 @@ class PageServer:
 
     :param viewers: called in the server's thread when the number of pages has changed.
     :param button: called in the server's thread with the button that was pressed.
-    :param about: what each page is told once, such as the computer's name.
+    :param about: data that each page gets once, such as the computer's name.
     """
 
     def __init__(self, access: Access, port: int, viewers: Callable[[], None],
@@ -144,12 +144,12 @@ class PageServer:
             self._thread.join(STOP_TIMEOUT)
 
     def send_state(self, state: dict[str, Any]) -> None:
-        """Send a state to every page; one that still waits is replaced."""
+        """Send a state to every page; it replaces a state that still waits."""
         text = _message('state', state)
         self._call(lambda page: setattr(page, 'state', text))
 
     def send_image(self, image: bytes) -> None:
-        """Send a JPEG to every page; one that still waits is replaced."""
+        """Send a JPEG to every page; it replaces a JPEG that still waits."""
         self._call(lambda page: setattr(page, 'image', image))
 
     def send_history(self, history: dict[str, Any]) -> None:
@@ -163,7 +163,7 @@ class PageServer:
         self._call(greet)
 
     def send_answer(self, button: str, success: bool, text: str) -> None:
-        """Send the answer to a button to every page: a second pilot sees it, too."""
+        """Send the answer to a button to every page, so that other people see it, too."""
         answer = _message('answer', {'button': button, 'success': success, 'text': text[:400]})
         self._call(lambda page: page.answers.append(answer))
 

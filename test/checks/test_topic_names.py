@@ -77,7 +77,8 @@ def test_a_pose_is_named_if_there_is_no_odometry(msgtype: str) -> None:
     poses = {'/goal_pose': POSES[0], '/vio/pose': msgtype, '/scan': 'sensor_msgs/msg/LaserScan'}
     assert offer('odom', poses).startswith(f'/vio/pose has type {msgtype}')
     assert '/vio/odom' in offer('odom', {**poses, '/vio/odom': ODOMETRY})
-    assert offer('odom', {'/goal_pose': POSES[0]}) == ''
+    for other in ('/goal_pose', '/drone1/neighbors/leader/pose'):
+        assert offer('odom', {other: POSES[0]}) == '', other
 
 
 def test_remaps_are_ours_first_as_in_ros() -> None:

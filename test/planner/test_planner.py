@@ -550,7 +550,7 @@ FAST, SLOW, TOO_SLOW = (0.03,) * 20, (0.16,) * 20, (0.26,) * 20
     (0.19, SLOW, ''), (0.20, SLOW, 'odometry late (0.20 s)'),  # 1.2 times what is usual
     (0.19, (*FAST[1:], 0.16), ''), (0.24, (*FAST[1:], 0.5), ''),  # after one hiccup
     (0.25, (*FAST[1:], 0.5), 'odometry late (0.25 s)'),
-    (0.02, TOO_SLOW, 'odometry too slow (0.26 s old before the next comes)')])
+    (0.02, TOO_SLOW, 'odometry too slow (0.26 s old when the next message arrives)')])
 def test_odometry_is_late_by_age_its_messages_usually_reach(
         age: float, ages: tuple[float, ...], reason: str) -> None:
     assert odometry_delay(own(1.0)._replace(ages=ages), 1.0 + age, PARAMS) == reason

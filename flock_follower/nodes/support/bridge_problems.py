@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Diagnostics of the MAVLink bridge: its values and problems, by the bridge's state.
+Diagnostics of the MAVLink bridge: the values and problems in the bridge's state.
 
 The executor's thread calls all but ``take``.
 """
