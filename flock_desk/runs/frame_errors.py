@@ -201,12 +201,12 @@ def _interpolate(states: array[float], stamps: Array) -> _States:
     The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
     result = _States(*(np.full((len(stamps), *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
-    rows = np.array(states).reshape(-1, _STATE_LENGTH)
-    if not len(rows):
+    read = np.array(states).reshape(-1, _STATE_LENGTH)
+    if not len(read):
         return result
     # By their stamps, of equal ones the first: a stamp far ahead must not hide the later ones.
-    times, first = np.unique(rows[:, 0], return_index=True)
-    rows = rows[first]
+    times, first = np.unique(read[:, 0], return_index=True)
+    rows = read[first]
     after = np.minimum(np.searchsorted(times, stamps), len(rows) - 1)
     before = np.where(times[after] == stamps, after, np.maximum(after - 1, 0))
     known = ((times[before] <= stamps) & (stamps <= times[after])
