@@ -34,6 +34,7 @@ REFERENCE: Final[float] = 2.0e-3
 FASTER: Final[float] = 0.1
 #: Time between two samples, s.
 PERIOD: Final[float] = 1.0
+#: Pixels of random gray levels, (240, 320).
 _IMAGE: Final = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
 
 
