@@ -34,8 +34,8 @@ REFERENCE: Final[float] = 2.0e-3
 FASTER: Final[float] = 0.1
 #: Time between two samples, s.
 PERIOD: Final[float] = 1.0
-#: The image of the work: noise.
-IMAGE: Final = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
+#: Pixels of random gray levels, (240, 320).
+_IMAGE: Final = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
 
 
 class Yardstick:
@@ -68,5 +68,5 @@ def work() -> float:
         matrix = matrix / (1.0 + matrix[0, 0])
     for _ in range(6):
         cv2.adaptiveThreshold(
-            IMAGE, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, 11, 5)
+            _IMAGE, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, 11, 5)
     return time.thread_time() - begin

@@ -254,8 +254,8 @@ class Bridge:
         self.housekeeping.step(now, self.alive(now))
         for change in self.housekeeping.changes():
             self.ground_station.take_warning(change)
-        self._end_flight(now)
         self.requests.step(self._streaming_for(now), now)
+        self._end_flight(now)
         # On a line too slow for all, setpoints go first.
         if self._reports and self.alive(now) and not self.link.transport.is_congested():
             for message in self.ground_station.due(self._boot_time(now), now):
@@ -286,8 +286,10 @@ class Bridge:
         if self.gate.permission.cause is not Cause.SILENT:
             return
         self.ground_station.take_handover(self.gate.permission.reason)
-        # While the mode is unknown the pilot may have taken over: nothing is requested.
-        if self._blind_action == 'land' and self.status(now) is not None:
+        # While the mode is unknown the pilot may have taken over: nothing is requested. Nor does a
+        # landing replace the mode requested for a stick that moved.
+        if self._blind_action == 'land' and self.status(now) is not None and (
+                self.end.handover.cause is not Cause.STICK):
             self.blind_landing = self.requests.pending if self.requests.landing else (
                 self.requests.begin(commands.land, now, end=Handover(
                     self.gate.permission.reason, cause=Cause.SILENT)))
