@@ -296,3 +296,33 @@ def test_flight_node_starts_without_libraries_of_others(node):
     ran = subprocess.run([sys.executable, '-c', code, '--ros-args', '-p', 'unknown:=1'],
                          capture_output=True, text=True, check=False)
     assert ran.returncode == 1 and f'unknown parameter unknown for node {node}' in ran.stderr
+
+
+def mutated() -> dict[str, tuple[Path, ...]]:
+    """Return the tests of each module that ``make mutation`` mutates."""
+    rows = (line.split() for line in (ROOT / '.ci/mutation').read_text().splitlines())
+    return {row[0]: tuple(ROOT / 'test' / f'{name}.py' for name in row[3:])
+            for row in rows if len(row) > 3 and row[1].isdecimal()}
+
+
+@pytest.mark.parametrize('module', mutated())
+def test_mutation_installs_all_that_its_tests_load(module: str) -> None:
+    waiting, ours, libraries = [*mutated()[module]], set(), set()
+    for path in waiting:
+        for name in imports_of(path):
+            top = name.partition('.')[0]
+            helper = next(iter((ROOT / 'test').rglob(f'{top}.py')), None)
+            if top in PACKAGES:
+                ours.add(name if name in read_house() else name.rpartition('.')[0])
+            elif helper is None:
+                libraries.add(top)
+            elif helper not in waiting:
+                waiting.append(helper)
+    for name in set().union(*map(loaded, ours)):
+        libraries |= read_house()[name].libraries
+    installed = {{'opencv-python-headless': 'cv2', 'pyyaml': 'yaml'}.get(name, name) for name in (
+        line.partition('==')[0]
+        for line in (ROOT / 'requirements/mutation.in').read_text().splitlines())}
+    lazy = {'ament_index_python', 'distributed', 'tqdm'}  # imported where they are used
+    assert not {each for each in libraries - sys.stdlib_module_names - installed - lazy
+                if not is_ros(each)}

@@ -136,16 +136,10 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     left = float(v[2]) + vertical * period
     within = complex(*(-v[:2] / period)), math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
     goal = complex(*limit_norm(a, SANE)[:2])
-    for k, (normal, least) in enumerate(bounds):
-        if missed[k] and sides[k][2] == COHESION:
-            correction = COHESION_INSISTENCE * (least - product(normal, goal))
-            step = min(correction, SANE) / abs(normal) ** 2
-            reached = Discs(*within, *within).best(goal + step * normal)
-            bounds[k] = normal, min(least, product(normal, reached))
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
-    firm = [bounds[k] for k in range(len(bounds)) if sides[k][2] != COHESION]
-    if len(firm) < len(bounds) and any(missed):
-        _yield_cohesion(goal, bounds, firm, sides, discs)
+    cohesion = [k for k, side in enumerate(sides) if side[2] == COHESION]
+    if cohesion:
+        _yield_cohesion(goal, bounds, cohesion, Discs(*within, *within), discs)
     point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.
@@ -157,18 +151,28 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
 
 
-def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]],
-                    firm: Sequence[tuple[complex, float]],
-                    sides: Sequence[tuple[complex, float, str]], discs: Discs) -> None:
+def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]], cohesion: Sequence[int],
+                    by_speed: Discs, discs: Discs) -> None:
     """
-    Reduce the cohesion bounds to the motion towards the neighbor that firm bounds leave.
+    Reduce the cohesion bounds, first by ``COHESION_INSISTENCE``: see ``keep_bounds``.
 
-    Against an opposite firm bound only a motion across would still bring it a little nearer, and
-    that would be as hard as the vehicle can.
+    Then to the motion towards the neighbor that firm bounds leave: against an opposite firm bound
+    only a motion across would still bring the vehicle a little nearer, as hard as it can.
+
+    :param cohesion: indices of the cohesion bounds; the other bounds are firm.
+    :param by_speed: limits by the speed alone; :param discs: all limits.
     """
+    for k in cohesion:
+        normal, least = bounds[k]
+        correction = COHESION_INSISTENCE * (least - product(normal, goal))
+        if correction > 0.0:
+            step = min(correction, SANE) / abs(normal) ** 2
+            bounds[k] = normal, min(least, product(normal, by_speed.best(goal + step * normal)))
+    firm = [each for k, each in enumerate(bounds) if k not in cohesion]
     start = nearest_in_order(goal, firm, discs)
-    for k, (normal, least) in enumerate(bounds):
-        if sides[k][2] == COHESION and product(normal, start) < least:
+    for k in cohesion:
+        normal, least = bounds[k]
+        if product(normal, start) < least:
             room = min((max(product(other, start) - bound, 0.0) / -product(other, normal)
                         for other, bound in firm if product(other, normal) < 0.0),
                        default=math.inf)

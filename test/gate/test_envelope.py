@@ -164,6 +164,9 @@ def test_the_bounds_are_those_of_the_approach_speeds():
     least, most = vertical_range(limits, place, 0.1, 0.5, limits.a_max)
     assert least == pytest.approx((-approach_speed(0.5, braking) + 0.2) / 0.5)
     assert most == pytest.approx((approach_speed(9.0, braking) - 0.1) / 0.5)
+    assert approach_speed(9.0, 0.5) == pytest.approx(math.sqrt(0.2 ** 2 + 9.0) - 0.2)
+    near = Location(1.0, -0.2, np.array([0.0, 24.0]))
+    assert inward(limits, near, np.array([0.0, 0.5, 0.0]), 0.5) is None  # of a radius of 50 m
     normal, bound = inward(limits, place, np.array([0.0, 0.5, 0.0]), 0.5)
     assert normal == -1j
     assert bound == pytest.approx((0.5 - approach_speed(10.0, braking)) / 0.5)

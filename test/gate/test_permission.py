@@ -98,6 +98,7 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
         assert permission.taken_over(now).startswith(
             f'the pilot, or a failsafe, took over {seconds} s ago')
         assert permission.name_taker(STICK, now).taken_over(now).startswith('the pilot took over')
+        assert not permission.name_taker(STICK, now).taken_over(15.0)  # 10 s from the takeover
     assert permission.taken_over(14.9)
     failed = permission.name_taker(takeover.failsafe('fence'), 6.0)
     assert not failed.taken_over(6.0)

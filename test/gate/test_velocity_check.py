@@ -69,7 +69,7 @@ def test_a_velocity_is_plausible_up_to_the_fastest(speed: float, known: bool) ->
 
 # Two sources that may disagree.
 
-def test_velocities_are_compared_if_commands_rest_on_odometry() -> None:
+def test_velocities_are_compared_if_commands_use_odometry() -> None:
     np.testing.assert_allclose(by(ODOM).difference, [0.1, -0.2, 0.0])
     assert by(AUTOPILOT).difference is None
     assert by(ODOM, autopilot=ACROSS._replace(**LATE)).difference is None
