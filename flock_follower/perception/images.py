@@ -140,11 +140,6 @@ _ENCODINGS |= {wide: (2 * _ENCODINGS[narrow][0], _ENCODINGS[narrow][1])
                for wide, narrow in _WIDE.items()}
 
 
-#: Function of OpenBLAS that sets the number of threads, by the names that builds give it.
-_SET_BLAS_THREADS = [f'{prefix}openblas_set_num_threads{suffix}'
-                     for prefix in ('', 'scipy_') for suffix in ('', '64_')]
-
-
 def compute_in_one_thread() -> None:
     """
     Restrict OpenCV, and OpenBLAS if numpy uses it, to the calling thread.
@@ -156,8 +151,8 @@ def compute_in_one_thread() -> None:
     maps = Path('/proc/self/maps')
     for library in map(ctypes.CDLL, set(re.findall(
             r'/.*openblas.*', maps.read_text(encoding='utf-8') if maps.exists() else ''))):
-        for name in _SET_BLAS_THREADS:
-            getattr(library, name, int)(1)
+        for build in ('openblas{}', 'openblas{}64_', 'scipy_openblas{}', 'scipy_openblas{}64_'):
+            getattr(library, build.format('_set_num_threads'), int)(1)
 
 
 class DecodedImage:

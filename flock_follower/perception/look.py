@@ -41,7 +41,7 @@ from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
-from flock_follower.perception.pose import locate_by_edges, MAX_TURN, Target
+from flock_follower.perception.pose import contradicts, locate, MAX_TURN, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.square_pose import refine
 from flock_follower.perception.time_offset import MountedCamera
@@ -263,26 +263,23 @@ class Look:
         return [name for name in self.anywhere if name not in self.measured]
 
     def confirmed(self, image: GrayImage, found: Measurement, sought: Target,
-                  dictionary: str, can_wait: bool) -> Measurement:
-        """
-        Return a measurement of a neighbor, or the fault of its detected marker.
-
-        :param can_wait: whether the image was also to be checked for the mirrored attitude: with a
-            confirmation it would take too long.
-        """
+                  dictionary: str) -> Measurement:
+        """Return a measurement of a neighbor, or the fault of its detected marker."""
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
-            if found.margin is not None or self.stamp - confirmed_at.get(name, -math.inf) <= (
-                    (1 + can_wait) * CONFIRM_PERIOD):
+            recent = self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD
+            if recent or found.margin is not None:  # both would take too long for one image
                 return found
-            place = found.T_camera_body
+            place, prior = found.T_camera_body, PosePrior(None, self.expected[name].up)
             ids, corners = search.near(
                 image, self.model, dictionary, sought.neighbor, place, False)
             for index, marker in enumerate(sought.neighbor.markers):
                 middle = place.apply(marker.T_body_marker.translation)
                 for outline in corners[ids == marker.marker_id]:
-                    again = locate_by_edges(
-                        image, self.model, sought, index, outline, self.expected[name].up)
+                    if not contradicts(
+                            image, self.model, sought, index, outline, place, prior.up):
+                        continue
+                    again = locate(image, self.model, sought, index, outline, prior, False)
                     if again is not None and angle(again.T_camera_body, place) > MAX_TURN and (
                             math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),
                                       middle) < marker.side_length):

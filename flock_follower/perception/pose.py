@@ -167,7 +167,7 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
     if whole is None:
         starts = _smear_starts(image, camera, sought, pose, smeared)
         if smeared:
-            whole = _fit_whole(image, camera, sought, starts, AS_BEFORE_STEPS)
+            whole = _fit_whole(image, camera, sought, starts)
         elif not starts:
             return None, None
     if whole is not None and whole.fit.blur > EDGELESS:
@@ -188,7 +188,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
     """Return the measurement of a fit to edges, also of the mirrored attitude if necessary."""
     if not check_mirrored:
         return _measurement(sought, found, None)
-    chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
+    chosen = _hypothesis_of(found)
     if len(found.lines.model.codes) > 1:
         return _measurement(sought, found, Choice(chosen, math.inf))
     best = choose([chosen, *_mirrored_hypotheses(camera, found)], expected)
@@ -233,23 +233,27 @@ def _starts_of(camera: CameraModel, sought: Target, index: int,
         pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
 
 
-def locate_by_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-                    corners: Array, up: Array | None) -> Measurement | None:
+def _hypothesis_of(found: EdgeFit) -> Hypothesis:
+    return Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
+
+
+def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
+                pose: Transform, up: Array | None) -> bool:
     """
-    Return a neighbor by the edges of one detected marker, or None if no pose fits them.
+    Return whether a detected marker fits another attitude than that of ``pose``, T_camera_body.
 
-    This costs half as much as :func:`locate`: one attitude is fitted to the image, and the
-    mirrored attitude to the edges that this fit found.
-
-    :param index, corners: as in :func:`locate`. :param up: as in ``PosePrior``.
+    This costs half as much as :func:`locate`, which returns the right pose if the result is True:
+    one attitude is fitted to the image, and the mirrored attitude to the edges that this fit
+    found.
     """
     alone, starts = _starts_of(camera, sought, index, corners)
     for start in starts:
         found = fit(image, camera, alone, start)
         if found is not None and found.inlier_share > FOUND_INLIER_SHARE:
-            return _of_edges(image, camera, sought, found, PosePrior(None, up), None, True) if (
-                _find_shown(image, found).all()) else None
-    return None
+            best = choose([_hypothesis_of(found), *_mirrored_hypotheses(camera, found)],
+                          PosePrior(None, up))
+            return angle(best.chosen.pose, pose) > MAX_TURN
+    return False
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
@@ -325,16 +329,12 @@ def _fit_as_before(image: GrayImage, camera: CameraModel, sought: Target, pose: 
 
 
 def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
-               starts: list[tuple[int, SmearStart]], spent: int = 0) -> _Whole | None:
-    """
-    Return the fit to the first marker whose smeared print fits the image, or None.
-
-    :param spent: steps of a fit that failed before: they count as steps of this one.
-    """
+               starts: list[tuple[int, SmearStart]]) -> _Whole | None:
+    """Return the fit to the first marker whose smeared print fits the image, or None."""
     for k, start in starts:
         found = descend(image, camera, sought.smears[k], start)
         if found is not None:
-            return _Whole(k, found._replace(steps=found.steps + spent))
+            return _Whole(k, found)
     return None
 
 

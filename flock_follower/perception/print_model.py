@@ -243,14 +243,13 @@ def _compare_in_uneven_light(brightness: Array, code: CellCode,
     bits = np.where(hidden, 0.0, colors[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
     wrong = _wrong((bits * code.bits)[~hidden])
-    too_many = max(0.5 * code.errors, 1.0)
     # Codewords differ by more than twice the errors: hidden cells leave a difference.
-    return (wrong < (0.5 if count and not tracked else too_many)
+    return (wrong < (0.5 if count and not tracked else max(0.5 * code.errors, 1.0))
             and count <= most * len(hidden) and (tracked or count <= 2 * code.errors)
             and _is_word(bits, code)
             and np.count_nonzero(colors[border] < 0.0) >= _MIN_BORDER * code.border
             and np.count_nonzero(colors[around] > 0.0) >= _MIN_AROUND * len(colors[around])
-            ), wrong / too_many
+            ), wrong / max(0.5 * code.errors, 1.0)
 
 
 def _is_word(read: Array, code: CellCode) -> bool:

@@ -27,7 +27,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 import math
-from typing import Any
 
 import cv2
 import numpy as np
@@ -215,9 +214,7 @@ def _from_square(outlines: Array) -> Array:
 def _local(brightness: Array) -> Array:
     """Return the difference of each cell of squares (n, c) from its surroundings, of norm 1."""
     differs = brightness.astype(float).dot(_differences(math.isqrt(brightness.shape[1])))
-    normalized: Array = differs / np.maximum(
-        np.linalg.norm(differs, axis=1, keepdims=True), 1e-6)
-    return normalized
+    return differs / np.maximum(np.linalg.norm(differs, axis=1, keepdims=True), 1e-6)
 
 
 @lru_cache(maxsize=16)
@@ -266,7 +263,7 @@ def _squares(outlines: list[Array], max_hidden: Array) -> Array:
     """
     counts = np.array([len(outline) for outline in outlines])
     index, corners = np.zeros(0, dtype=np.intp), np.zeros((0, _MAX_CORNERS, 2))
-    several: list[tuple[Any, Array]] = []  # quadrilaterals of which one side of five is removed
+    several: list[Array] = []  # of which one side of five is removed
     for count in range(_MAX_CORNERS, 4, -1):
         with_count = (counts == count).nonzero()[0]
         index = np.concatenate([index, with_count])
@@ -279,14 +276,10 @@ def _squares(outlines: list[Array], max_hidden: Array) -> Array:
         removed = hidden.min(axis=1) < (
             np.inf if count > 5 else _BLUNT_SHARE * max_hidden[index])
         if count == 5:
-            row, side = ((hidden < np.inf) & ~removed[:, None]).nonzero()
-            several.append((index[row], fewer[row, side]))
+            several.append(fewer[(hidden < np.inf) & ~removed[:, None]])
         index, corners = index[removed], fewer[removed, least[removed]]
-    whole = (counts == 4).nonzero()[0]
-    several += [(index, corners), (whole, np.reshape(
-        [outlines[k] for k in whole.tolist()], (-1, 4, 2)))]
-    order = np.argsort(np.concatenate([each for each, _ in several]), kind='stable')
-    return np.concatenate([each for _, each in several])[order]
+    whole = [outline for outline in outlines if len(outline) == 4]
+    return np.concatenate([np.reshape(whole, (-1, 4, 2)), corners, *several])
 
 
 def _without_sides(corners: Array) -> tuple[Array, Array]:

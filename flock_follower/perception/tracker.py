@@ -326,10 +326,9 @@ class Tracker:
         if self._of_candidate(look, found):
             look.others.append(found)
             return
-        unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
-        found = look.confirmed(image, found, self._targets[name], self.config.dictionary,
-                               not unchecked[name])
+        found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
+        unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
         if found.margin is not None:
             unchecked[name] = self._images_unchecked(found, look.expected[name])
         elif found.spacing is None and last is not None and last.spacing is not None:
