@@ -219,6 +219,8 @@ def _search_spacing(lines: Lines) -> tuple[float, float]:
 MIN_INLIER_SHARE = 0.5
 #: Largest RMS of the residuals of an accepted pose, px.
 MAX_RMS = 0.4
+#: The same as a share of the narrowest cell, if that is more: the halo of a reflex grows with it.
+_MAX_RMS_SHARE = 0.03
 #: Largest residual of an edge in place, px, or three times the RMS if that is more.
 MAX_INLIER_ERROR = 0.4
 #: Prior of either shift of bloom, px (1 sigma).
@@ -344,7 +346,8 @@ def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
     in_place = found.found & (last.squares < max(MAX_INLIER_ERROR**2, 9.0 * square))
     inlier_share, rms = np.count_nonzero(in_place) / len(lines.model), math.sqrt(square)
     covariance = normal_covariance(last.information)
-    if covariance is None or not (inlier_share > MIN_INLIER_SHARE and rms < MAX_RMS):
+    max_rms = max(MAX_RMS, _MAX_RMS_SHARE * min(lines.narrowest))
+    if covariance is None or not (inlier_share > MIN_INLIER_SHARE and rms < max_rms):
         return None
     weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(

@@ -95,6 +95,9 @@ AS_BEFORE_STEPS = 6
 #: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
 #: residuals are errors of the model, which are alike for neighboring samples.
 EFFECTIVE_SMEAR_SAMPLES = 40.0
+#: Probability of the mirrored attitude if no fit of the first smeared print ends there, or if
+#: a part of that print is covered: one of seven such fits was to the wrong attitude.
+UNRIVALED_DOUBT = 0.15
 
 
 class Target(NamedTuple):
@@ -131,7 +134,8 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         if sharp:
             return None
     if found is None:  # it is smeared, or it moved farther than expected
-        found, whole = _fit_around(image, camera, sought, expected.pose, last if smeared else None)
+        found, whole = _fit_around(image, camera, sought, expected.pose,
+                                   last if smeared else None, spacing is None)
     # The other edges may be out of reach.
     if found is not None and found.inlier_share < PLAIN_INLIER_SHARE:
         again = fit(image, camera, found.lines.model, found.pose)
@@ -156,11 +160,13 @@ class _Whole(NamedTuple):
 
 
 def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
-                last: Measurement | None) -> tuple[EdgeFit | None, _Whole | None]:
+                last: Measurement | None,
+                searched: bool) -> tuple[EdgeFit | None, _Whole | None]:
     """
     Return fits to the edges and to a whole print up to two cells and a half from a pose.
 
     :param last: the last measurement, if the print was smeared in it.
+    :param searched: whether edges up to half a cell from the pose were looked for already.
     """
     smeared, starts = last is not None, list[tuple[int, SmearStart]]()
     whole = None if last is None else _fit_as_before(image, camera, sought, pose, last)
@@ -168,13 +174,18 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
         starts = _smear_starts(image, camera, sought, pose, smeared)
         if smeared:
             whole = _fit_whole(image, camera, sought, starts)
-        elif not starts:
+        elif not starts and searched:
             return None, None
     if whole is not None and whole.fit.blur > EDGELESS:
         return None, whole
     place = starts[0][1].pose if starts else pose
     found, sharp = _fit_shown(image, camera, sought.model,
                               place if whole is None else whole.fit.pose, None)
+    if whole is not None and found is None and not sharp:
+        # Little smear leaves edges: if they are not there, the attitude may be the mirrored one.
+        other = _mirrored_body(sought, whole.number, whole.fit.pose)
+        if other is not None:
+            found, sharp = _fit_shown(image, camera, sought.model, other, None)
     if sharp:
         return None, None
     if found is not None:  # from afar it may have settled early
@@ -353,10 +364,12 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Wh
     other = None if start is None or steps < 1 else descend(
         image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True,
         steps)
-    if start is not None and other is None and can_wait:
+    if start is not None and other is None:
         return _with_doubt(sought, found, last)
-    return _choose_smeared(
-        sought, index, [fitted] if other is None else [fitted, other], expected)
+    # Little smear leaves edges: if they do not fit, something covers a part of the print.
+    covered = last is None and fitted.blur < PLAIN_BLUR
+    return _choose_smeared(sought, index, [fitted] if other is None else [fitted, other], expected,
+                           UNRIVALED_DOUBT if covered else 0.0)
 
 
 def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | None:
@@ -366,16 +379,19 @@ def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | N
 
 
 def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
-                    expected: PosePrior) -> Measurement:
+                    expected: PosePrior, least_doubt: float) -> Measurement:
     """
     Return the measurement of the likelier of one or both attitudes of a smeared marker.
 
     The image says little about the attitude, so the expected attitude is not used: it would
     confirm itself.
+
+    :param least_doubt: least probability of the other attitude.
     """
     least = min(each.rms for each in fits)
     best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
                    for each in fits], PosePrior(None, expected.up))
+    best = best._replace(share=max(best.share, least_doubt))
     return mix_poses(_smear_measurement(sought, index, best.chosen.fit), best)
 
 
@@ -384,12 +400,13 @@ def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Meas
     pose = found.fit.pose
     measurement = _smear_measurement(sought, found.number, found.fit)
     other = _mirrored_body(sought, found.number, pose)
-    if other is None or last is None:
+    if other is None:
         return measurement
-    turned = angle(other, last.T_camera_body) < angle(pose, last.T_camera_body)
+    doubt = UNRIVALED_DOUBT if last is None else last.doubt
+    if last is not None and angle(other, last.T_camera_body) < angle(pose, last.T_camera_body):
+        doubt = 1.0 - doubt
     return mix_poses(measurement, Choice(
-        Hypothesis(pose, 0.0), 0.0, Hypothesis(other, 0.0),
-        1.0 - last.doubt if turned else last.doubt))._replace(margin=None)
+        Hypothesis(pose, 0.0), 0.0, Hypothesis(other, 0.0), doubt))._replace(margin=None)
 
 
 def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measurement:

@@ -20,6 +20,7 @@ import math
 from typing import Any
 import warnings
 
+import cv2
 from marker_images import (
     Cover,
     DICTIONARY,
@@ -95,6 +96,16 @@ def test_distance_has_no_bias(camera: CameraModel, conditions: dict[str, float])
             found.pose.inverse().apply(found.center[None]))[0, 2])
     assert abs(np.mean(ratios) - 1.0) < 0.003
     assert np.std(ratios) < 0.006
+
+
+@pytest.mark.parametrize(('distance', 'is_found'), [(0.65, True), (1.6, False)])
+def test_errors_of_edges_are_bounded_by_size_of_cells(distance: float, is_found: bool) -> None:
+    camera = make_camera(width=320, height=320)
+    pose = facing((0.0, 0.0, distance), (0.1, 0.2, 0.0))  # 25 px a cell, or 10
+    v, u = np.mgrid[:320, :320].astype(np.float32)
+    waves = 0.85 * np.sin(0.3 * v).astype(np.float32), 0.85 * np.sin(0.3 * u).astype(np.float32)
+    image = cv2.remap(render(camera, {3: pose}), u + waves[0], v + waves[1], cv2.INTER_LINEAR)
+    assert (fit(image, camera, MODEL, pose) is not None) == is_found
 
 
 def test_edges_in_a_shadow_count() -> None:

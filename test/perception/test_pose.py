@@ -53,8 +53,8 @@ from flock_follower.perception.measurement import (
     Measurement,
     PosePrior,
 )
-from flock_follower.perception.pose import locate, Target, target, track
-from flock_follower.perception.smear_fit import fit_smeared
+from flock_follower.perception.pose import locate, Target, target, track, UNRIVALED_DOUBT
+from flock_follower.perception.smear_fit import fit_smeared, SmearFit
 
 LEADER = target(MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)), DICTIONARY)
 CAMERA = make_camera()
@@ -219,6 +219,46 @@ def test_a_print_whose_edges_run_together_is_fitted_whole(cells: float, blurred:
     assert (found.spacing is None) is blurred
     assert (found.alike > 0.0) is blurred
     assert np.linalg.norm(error(found, body(marker))[3:]) < 0.05
+
+
+def test_edges_turn_a_track_that_a_smear_fit_confirms(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = make_camera(width=320, height=320)
+    marker = facing((0.03, -0.02, 0.65), (0.0, 0.5, 0.0))  # 25 px a cell
+    image, truth, wrong = render(camera, {0: marker}), body(marker), body(mirrored(marker))
+    stuck = SmearFit(wrong, 1e-4 * np.eye(6), 0.05, np.array([0.2, 0.0]), 0, 3)
+    monkeypatch.setattr(pose_module, 'descend', lambda *_: stuck)
+    last = tracked(image, camera, LEADER, truth)._replace(
+        T_camera_body=wrong, spacing=None, smear=stuck.smear)
+    found = known(track(image, camera, LEADER, PosePrior(wrong), last, True))
+    assert found.spacing is not None
+    assert chi2(found, truth) < 22.5
+
+
+def test_attitude_without_rival_fit_covers_the_mirrored_one(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    # The mirrored attitude was not fitted: that is no evidence against it.
+    marker = facing((0.03, -0.02, 1.2), (0.0, 0.45, 0.0))
+    image = render(SMALL, {0: marker}, motion=(12.0, 4.0))
+    monkeypatch.setattr(pose_module, 'descend', lambda *_: None)
+    found = known(locate(image, SMALL, LEADER, 0, corners_of(SMALL, marker), PosePrior()))
+    assert found.spacing is None
+    assert found.doubt == UNRIVALED_DOUBT
+    assert chi2(found, body(marker)) < 16.0
+    assert chi2(found, body(mirrored(marker))) < 16.0
+
+
+def test_large_marker_beyond_its_profiles_is_found_by_its_edges(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_module, 'seek', lambda *_: None)  # a reflex spoils the likeness
+    camera = make_camera(width=320, height=320)
+    marker = facing((0.0, 0.0, 0.65), (0.1, 0.3, 0.05))  # 25 px a cell
+    image, truth = render(camera, {0: marker}), body(marker)
+    last = tracked(image, camera, LEADER, truth)
+    aside = np.array([0.0064, 0.0026, 0.0])  # 6 px and 2 px: profiles reach 2 px
+    found = known(track(image, camera, LEADER, PosePrior(
+        Transform(truth.rotation, truth.translation + aside)), last, True))
+    assert found.spacing is not None
+    assert chi2(found, truth) < 22.5
 
 
 def test_clear_edges_with_hidden_code_do_not_count_as_smear(
