@@ -201,7 +201,7 @@ def _interpolate(states: array[float], stamps: Array) -> _States:
     The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
     result = _States(*(np.full((len(stamps), *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
-    rows = np.array(states).reshape(-1, _STATE_LENGTH)
+    rows: Array = np.array(states).reshape(-1, _STATE_LENGTH)
     if not len(rows):
         return result
     # By their stamps, of equal ones the first: a stamp far ahead must not hide the later ones.
