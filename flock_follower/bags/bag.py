@@ -38,7 +38,7 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from flock_follower.bags.bag_files import BagFiles, find_files, unpacking, ZSTD
+from flock_follower.bags.bag_files import BagFiles, find_files, packed_fault, ZSTD
 from flock_follower.bags.message_types import migration_obstacle, typestore
 from flock_follower.bags.sequential import (
     in_order,
@@ -231,7 +231,7 @@ def open_bag(path: str | Path) -> Bag:
     if not path.exists():
         raise BagError(f'{path}: no such bag')
     if path.suffix == ZSTD and path.is_file():
-        raise BagError(f'{path}: {unpacking([path])}')
+        raise BagError(f'{path}: {packed_fault([path])}')
     if path.suffix not in ('.bag', '.mcap', '.db3') and not path.is_dir():
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
     if path.suffix == '.bag' and path.is_file():

@@ -103,7 +103,7 @@ def _sqlite_size(file: Path) -> int:
     return pages * (65536 if page == 1 else page) if changed == valid_for else 0
 
 
-def unpacking(files: Sequence[Path]) -> str:
+def packed_fault(files: Sequence[Path]) -> str:
     """Return the fault of files that are compressed as a whole, and the commands against it."""
     commands = '; '.join(f'zstd -d {file} -o {file.with_suffix("")}' for file in files)
     return f'compressed as a whole; to unpack it: {commands}'
@@ -120,7 +120,7 @@ def _in_folder(folder: Path) -> BagFiles:
     except FileNotFoundError:
         if packed := [file for file in sorted(folder.glob(f'*{ZSTD}'))
                       if not file.with_suffix('').exists()]:
-            raise ValueError(f'no {METADATA} in it: {unpacking(packed)}') from None
+            raise ValueError(f'no {METADATA} in it: {packed_fault(packed)}') from None
         if not present:
             raise ValueError(f'no {METADATA} in it, so not a finished ROS 2 bag') from None
         return BagFiles(present, f'no {METADATA} in it')

@@ -140,7 +140,7 @@ class SequentialReader:
             newest = max(newest, stamp)
             connection = self._connections[channel]
             if connection.id in wanted and start <= stamp < stop:
-                heapq.heappush(held, (stamp, number, connection, unpacked(data) if is_compressed(
+                heapq.heappush(held, (stamp, number, connection, decompress(data) if is_compressed(
                     channel.encoding, data) else data))
             while held and held[0][0] <= newest - self.disorder:
                 yield _message_of(heapq.heappop(held))
@@ -204,7 +204,7 @@ def is_compressed(encoding: str, data: bytes) -> bool:
     return encoding == _CDR and data.startswith(_ZSTD)
 
 
-def unpacked(data: bytes) -> bytes:
+def decompress(data: bytes) -> bytes:
     """
     Return compressed data as they were.
 

@@ -391,6 +391,7 @@ def _checked_distortion(distortion: ArrayLike, model: str) -> Array:
     if d.size > count and not d[count:].any():
         d = d[:count]
     if d.size and d.size not in lengths:
-        raise ValueError(f'D has {d.size} elements: {model} takes {" or ".join(map(str, lengths))}')
+        raise ValueError(f'D has {d.size} elements: {model} takes '
+                         f'{" or ".join(map(str, lengths))}')
     # Simulators leave D empty; OpenCV writes plumb_bob without k3.
     return d if d.size >= count else np.append(d, np.zeros(count - d.size))

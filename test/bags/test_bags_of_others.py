@@ -28,7 +28,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from flock_follower.bags.bag import BagError, open_bag, serialize, typestore
 from flock_follower.bags.mcap_file import definition
-from flock_follower.bags.sequential import unpacked
+from flock_follower.bags.sequential import decompress
 
 START, STEP = 1_700_000_000_000_000_000, 10_000_000
 COUNT = 300
@@ -274,7 +274,7 @@ def test_compressed_files_alone_name_the_command_that_unpacks(
     assert error_of(file).endswith(said)
     (path / 'metadata.yaml').unlink()
     assert error_of(path).endswith(said)
-    file.with_suffix('').write_bytes(unpacked(file.read_bytes()))
+    file.with_suffix('').write_bytes(decompress(file.read_bytes()))
     assert read(path) == ('no metadata.yaml in it', {})
 
 
