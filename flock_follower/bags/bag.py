@@ -29,6 +29,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from copy import copy
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -37,9 +38,15 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from flock_follower.bags.bag_files import BagFiles, find_files
+from flock_follower.bags.bag_files import BagFiles, find_files, packed_fault, ZSTD
 from flock_follower.bags.message_types import migration_obstacle, typestore
-from flock_follower.bags.sequential import in_order, overlap, SequentialReader, Span
+from flock_follower.bags.sequential import (
+    in_order,
+    is_compressed,
+    overlap,
+    SequentialReader,
+    Span,
+)
 
 _UNREADABLE = 'corrupt, truncated or unsupported'
 _UNTYPED = '__schemaless__'  # rosbags' type of a channel whose schema the summary does not repeat
@@ -223,6 +230,8 @@ def open_bag(path: str | Path) -> Bag:
     path = Path(path).expanduser()
     if not path.exists():
         raise BagError(f'{path}: no such bag')
+    if path.suffix == ZSTD and path.is_file():
+        raise BagError(f'{path}: {packed_fault([path])}')
     if path.suffix not in ('.bag', '.mcap', '.db3') and not path.is_dir():
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
     if path.suffix == '.bag' and path.is_file():
@@ -258,7 +267,8 @@ def _ros2_reader(path: Path, files: BagFiles) -> Rosbag2Reader | SequentialReade
         try:
             reader = Rosbag2Reader(path)
             reader.open()
-            if files.compressed or all(map(_is_indexed, _storages(reader) or [reader.storage])):
+            if files.compressed or (not _is_compressed(reader) and all(
+                    map(_is_indexed, _storages(reader) or [reader.storage]))):
                 return reader
             reader.close()
         except Exception as error:  # as many as it has reasons to refuse a file
@@ -291,6 +301,12 @@ def _is_indexed(storage: Any) -> bool:
     listed = sum(connection.msgcount for connection in storage.connections)
     return indexed == listed == storage.metadata.message_count and all(
         connection.msgtype != _UNTYPED for connection in storage.connections)
+
+
+def _is_compressed(reader: Rosbag2Reader) -> bool:
+    """Return whether the first message is compressed."""
+    return any(is_compressed(connection.ext.serialization_format, data)
+               for connection, _, data in islice(reader.messages(), 1))
 
 
 def _by_topic(connections: Iterable[Connection]) -> dict[str, list[Connection]]:

@@ -30,7 +30,7 @@ import yaml
 
 from flock_follower.bags.mcap_file import incomplete, mcap_files, MCAP_MAGIC, METADATA
 
-MCAP, SQLITE = '.mcap', '.db3'
+MCAP, SQLITE, ZSTD = '.mcap', '.db3', '.zstd'
 _SQLITE_MAGIC = b'SQLite format 3\0'
 
 
@@ -102,6 +102,12 @@ def _sqlite_size(file: Path) -> int:
     return pages * (65536 if page == 1 else page) if changed == valid_for else 0
 
 
+def packed_fault(files: Sequence[Path]) -> str:
+    """Return the fault of files that are compressed as a whole, and the commands against it."""
+    commands = '; '.join(f'zstd -d {file} -o {file.with_suffix("")}' for file in files)
+    return f'compressed as a whole; to unpack it: {commands}'
+
+
 def _in_folder(folder: Path) -> BagFiles:
     present = mcap_files(folder) or sorted(
         folder.glob(f'*{SQLITE}'), key=lambda file: (len(file.name), file.name))
@@ -111,6 +117,9 @@ def _in_folder(folder: Path) -> BagFiles:
         named = [PurePath(name).name for name in described['relative_file_paths']]
         mode = str(described.get('compression_mode') or 'none').lower()
     except FileNotFoundError:
+        if packed := [file for file in sorted(folder.glob(f'*{ZSTD}'))
+                      if not file.with_suffix('').exists()]:
+            raise ValueError(f'no {METADATA} in it: {packed_fault(packed)}') from None
         if not present:
             raise ValueError(f'no {METADATA} in it, so not a finished ROS 2 bag') from None
         return BagFiles(present, f'no {METADATA} in it')
@@ -128,6 +137,6 @@ def _in_folder(folder: Path) -> BagFiles:
 
 def _cut_short(files: Sequence[Path]) -> str:
     for file in files:
-        if file.suffix == MCAP and not has_end(file):
+        if not file.stat().st_size or (file.suffix == MCAP and not has_end(file)):
             return f'{file.name} was cut short'
     return ''

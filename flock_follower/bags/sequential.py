@@ -32,6 +32,7 @@ import heapq
 from itertools import chain
 from pathlib import Path
 import sqlite3
+import sys
 from typing import NamedTuple
 
 from rosbags.interfaces import (
@@ -46,7 +47,7 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from flock_follower.bags.bag_files import has_end, MCAP
 
-_ROS1 = 'ros1'
+_ROS1, _CDR = 'ros1', 'cdr'
 _ZSTD = b'\x28\xb5\x2f\xfd'  # the first bytes of compressed data; those of CDR are 0
 
 
@@ -99,15 +100,12 @@ class SequentialReader:
         Scan the files, and omit empty files.
 
         :raises ValueError: all files are empty, a file holds fewer messages than its index states,
-            messages are compressed individually, or the library mcap is not installed.
+            or the library mcap is not installed.
         """
         counts: Counter[_Channel] = Counter()
         for file in self._files:
             newest = 0
-            for channel, stamp, data in _records(file):
-                if data.startswith(_ZSTD) and channel.encoding == 'cdr':
-                    raise ValueError(f'messages of {channel.topic} are compressed, which its '
-                                     'metadata.yaml must say')
+            for channel, stamp, _ in _records(file):
                 counts[channel] += 1
                 newest = max(newest, stamp)
                 self.disorder = max(self.disorder, newest - stamp)
@@ -142,7 +140,8 @@ class SequentialReader:
             newest = max(newest, stamp)
             connection = self._connections[channel]
             if connection.id in wanted and start <= stamp < stop:
-                heapq.heappush(held, (stamp, number, connection, data))
+                heapq.heappush(held, (stamp, number, connection, decompress(data) if is_compressed(
+                    channel.encoding, data) else data))
             while held and held[0][0] <= newest - self.disorder:
                 yield _message_of(heapq.heappop(held))
         while held:
@@ -200,6 +199,24 @@ def _merge(files: Sequence[tuple[Span, Iterator[_Message]]]) -> Iterator[_Messag
             read_on(number, messages)
 
 
+def is_compressed(encoding: str, data: bytes) -> bool:
+    """Return whether a message is compressed: only the metadata.yaml of its folder says so."""
+    return encoding == _CDR and data.startswith(_ZSTD)
+
+
+def decompress(data: bytes) -> bytes:
+    """
+    Return compressed data as they were.
+
+    :raises Exception: the library's, if they are damaged.
+    """
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd  # installed by rosbags
+    return zstd.decompress(data)
+
+
 def _message_of(held: tuple[int, int, Connection, bytes]) -> _Message:
     stamp, _, connection, data = held
     return connection, stamp, data
@@ -250,6 +267,8 @@ def _mcap_records(path: Path) -> Iterator[_Record]:
 
 
 def _sqlite_records(path: Path) -> Iterator[_Record]:
+    if not path.stat().st_size:
+        return
     with closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True)) as file:
         described = {row[1] for row in file.execute('PRAGMA table_info(topics)')}
         qos = 'offered_qos_profiles' if 'offered_qos_profiles' in described else "''"

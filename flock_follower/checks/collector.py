@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from functools import partial
 import math
 from typing import Any, Final
@@ -49,7 +50,7 @@ from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pose import locate, target
-from flock_follower.perception.prints import BORDER_WIDTHS, turned_print, wrong_border
+from flock_follower.perception.prints import BORDER_WIDTHS, Fault, turned_print, wrong_border
 from flock_follower.perception.search import everywhere
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pose_messages import from_pose
@@ -59,6 +60,7 @@ N_PICTURES: Final = 25  # images that are searched for markers
 PICTURE_PERIOD: Final = 0.1  # s, least time between two of these images
 PAIR_GAP: Final = (0.03, 0.16)  # s, least and largest time between two images that are compared
 N_PAIRS: Final = 90  # pairs of images whose shift is measured
+MIRRORED, INVERTED = 'print mirrored', 'print inverted'
 #: The name of all topics with the poses of another detector.
 POSES: Final = 'poses'
 
@@ -189,6 +191,8 @@ class Collector:
             for search in (thoroughly, _with_wide_borders):  # which take longer
                 if not markers.keys() & set(found.ids.tolist()):
                     found = _concatenate(found, search(pixels, config.dictionary))
+            if not len(found.ids):
+                picture.misprints += _never_detected(pixels, config.dictionary, markers)
             fits = camera is not None and pixels.shape == (camera.height, camera.width)
             up = _upwards(seen, path, picture.stamp) if len(found.ids) else None
             seen.sightings += self._measure(
@@ -274,6 +278,16 @@ def _with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
     """Return the markers with a border of two or three cells, and some with one."""
     return _concatenate(*(
         everywhere(image, dictionary, border=border) for border in BORDER_WIDTHS[1:]))
+
+
+def _never_detected(image: GrayImage, dictionary: str, ours: Container[int]) -> list[Fault]:
+    """Return the faults of our markers in an image without any that can be detected."""
+    return [Fault(reason, f'marker {number} is {reason.removeprefix("print ")}', remedy)
+            for reason, changed, remedy in (
+                (MIRRORED, np.ascontiguousarray(image[:, ::-1]),
+                 'print it as the command marker draws it; does the camera mirror its images?'),
+                (INVERTED, 255 - image, 'print it black on white'))
+            for number in everywhere(changed, dictionary).ids.tolist() if number in ours]
 
 
 def _concatenate(*found: Detections) -> Detections:

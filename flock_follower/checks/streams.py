@@ -106,8 +106,8 @@ def check_latency(seen: Observations, name: str, topic: TopicSeen,
          'set back again and again'),
         (repeated > REPEATED * len(topic.stamps), ERROR,
          f'{repeated} of {len(topic.stamps)} have the stamp of the message before',
-         'have the driver stamp each message when it is measured; of a camera that publishes each '
-         'image twice, or of two cameras in one topic, take one'),
+         'have the driver stamp each message when it is measured; if each is published twice, or '
+         'two sources share the topic, take one'),
         (abs(middle) > OTHER_CLOCK, ERROR,
          f'stamped {abs(middle):.0f} s {"before" if middle > 0.0 else "after"} it came: no stamp, '
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '

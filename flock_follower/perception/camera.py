@@ -45,8 +45,8 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
-#: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``);
-#: rational_polynomial may have 12 or 14.
+#: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``).
+#: Those of plumb_bob begin rational_polynomial's: of both the number counts, 4, 5, 8, 12 or 14.
 DISTORTION_MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 #: Focal lengths as a share of the image's longer side, beyond what any lens has (the widest
 #: fisheye 0.2): outside, K is in other units, or noise.
@@ -79,7 +79,7 @@ class CameraModel:
     ``radius`` is the radius in normalized coordinates up to which the distortion is one-to-one.
 
     :param matrix: K, shape (3, 3), px.
-    :param distortion: D; if the model allows it (no coefficients, or plumb_bob's first four),
+    :param distortion: D; if the model allows it (no coefficients, or the first four or five),
         missing coefficients are zero; additional zeros at the end are ignored.
     :param model: a key of ``DISTORTION_MODELS``; empty means plumb_bob.
     :param width: image width, px.
@@ -388,13 +388,13 @@ def _checked_matrix(matrix: Array) -> Array:
 def _checked_distortion(distortion: ArrayLike, model: str) -> Array:
     d: Array = np.array(distortion, dtype=float).ravel()
     count = DISTORTION_MODELS[model]
+    lengths = [4] if model == 'equidistant' else [4, 5, 8, 12, 14]
     if not np.all(np.isfinite(d)):
         raise ValueError(f'D = {d.tolist()}: must be finite')
     if d.size > count and not d[count:].any():
         d = d[:count]
+    if d.size and d.size not in lengths:
+        raise ValueError(f'D has {d.size} elements: {model} takes '
+                         f'{" or ".join(map(str, lengths))}')
     # Simulators leave D empty; OpenCV writes plumb_bob without k3.
-    if d.size == 0 or (model == 'plumb_bob' and d.size == 4):
-        d = np.append(d, np.zeros(count - d.size))
-    if d.size != count and not (model == 'rational_polynomial' and d.size in (12, 14)):
-        raise ValueError(f'D has {d.size} elements: {model} takes {count}')
-    return d
+    return d if d.size >= count else np.append(d, np.zeros(count - d.size))

@@ -28,6 +28,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from flock_follower.bags.bag import BagError, open_bag, serialize, typestore
 from flock_follower.bags.mcap_file import definition
+from flock_follower.bags.sequential import decompress
 
 START, STEP = 1_700_000_000_000_000_000, 10_000_000
 COUNT = 300
@@ -253,9 +254,37 @@ def test_compressed_bags_with_other_metadata_are_read(tmp_path: Path, mode: str)
     path = edit(write_rosbag2(tmp_path / 'bag', compression=mode),
                 r'offered_qos_profiles: .*', 'offered_qos_profiles: ""')
     assert read(path) == ('', {})
+
+
+@pytest.mark.parametrize('storage', SUFFIXES)
+def test_compressed_messages_are_read_without_their_metadata(
+        tmp_path: Path, storage: str) -> None:
+    path = write_rosbag2(tmp_path / 'bag', storage, 'MESSAGE')
+    assert read(path / f'bag{SUFFIXES[storage]}') == ('', {})
     (path / 'metadata.yaml').unlink()
-    assert ('messages of /chatter are compressed' if mode == 'MESSAGE' else 'no metadata.yaml in '
-            'it') in error_of(path)
+    assert read(path) == ('no metadata.yaml in it', {})
+
+
+@pytest.mark.parametrize('storage', SUFFIXES)
+def test_compressed_files_alone_name_the_command_that_unpacks(
+        tmp_path: Path, storage: str) -> None:
+    path = write_rosbag2(tmp_path / 'bag', storage, 'FILE')
+    file = path / f'bag{SUFFIXES[storage]}.zstd'
+    said = f': compressed as a whole; to unpack it: zstd -d {file} -o {file.with_suffix("")}'
+    assert error_of(file).endswith(said)
+    (path / 'metadata.yaml').unlink()
+    assert error_of(path).endswith(said)
+    file.with_suffix('').write_bytes(decompress(file.read_bytes()))
+    assert read(path) == ('no metadata.yaml in it', {})
+
+
+@pytest.mark.parametrize('storage', SUFFIXES)
+def test_an_empty_file_of_several_leaves_the_others(tmp_path: Path, storage: str) -> None:
+    path = write_rosbag2(tmp_path / 'bag', storage)
+    empty = f'bag_1{SUFFIXES[storage]}'
+    (path / empty).touch()
+    (path / 'metadata.yaml').unlink()
+    assert read(path)[0] == f'{empty} was cut short'
 
 
 def test_messages_compressed_in_an_unknown_way_are_refused(tmp_path: Path) -> None:

@@ -156,6 +156,16 @@ def test_drivers_ways_of_writing_d_are_accepted(model: str, D: list[float]) -> N
     assert len(camera.distortion) == DISTORTION_MODELS[camera.model]
 
 
+@pytest.mark.parametrize('count', [4, 5, 8, 12, 14])
+def test_number_of_coefficients_counts_not_the_models_name(count: int) -> None:
+    D = [-0.1, 0.05, 0.001, -0.001, 0.01, 0.02, -0.01, 0.005, *[0.003] * 6][:count]
+    expected, _ = cv2.projectPoints(points_ahead()[:, None], np.zeros(3), np.zeros(3), K,
+                                    np.array(D))
+    for model in ('plumb_bob', 'rational_polynomial'):
+        camera = CameraModel.from_calibration(K, D, model, 640, 480)
+        np.testing.assert_allclose(camera.project(points_ahead()), expected[:, 0], atol=1e-9)
+
+
 def test_region_of_interest_and_binning_see_the_same_rays() -> None:
     camera = make_camera()
     part = camera.scaled(100, 60, 400, 300, 2, 2)
@@ -173,8 +183,9 @@ def test_region_of_interest_and_binning_see_the_same_rays() -> None:
      r'focal length for 640x480 = 1\.0: must be a number in \[12\.8, 640000\] px'),
     ({'K': np.diag([600.0, 1e300, 1.0])}, r'focal length for 640x480 = 1e\+300'),
     ({'K': np.eye(4)}, 'K has 16 elements'),
-    ({'D': [0.1] * 3}, 'D has 3 elements: plumb_bob takes 5'),
-    ({'D': [0.1] * 8}, 'D has 8 elements: plumb_bob takes 5'),
+    ({'D': [0.1] * 3}, 'D has 3 elements: plumb_bob takes 4'),
+    ({'D': [0.1] * 9}, 'D has 9 elements: plumb_bob takes 4 or 5 or 8 or 12 or 14'),
+    ({'distortion_model': 'rational_polynomial', 'D': [0.1] * 6}, 'D has 6 elements: rational'),
     ({'D': [np.inf] * 5}, 'finite'),
     ({'distortion_model': 'magic'}, "'magic': must be one of plumb_bob, rational"),
     ({'distortion_model': 'equidistant', 'D': [-1.0] * 5}, 'equidistant takes 4'),

@@ -24,8 +24,8 @@ from marker_images import facing, Hovering, make_camera, render, SIDE, TAIL
 import numpy as np
 import pytest
 
-from flock_follower.checks.collector import Collector
-from flock_follower.checks.observations import Observations
+from flock_follower.checks.collector import Collector, INVERTED, MIRRORED
+from flock_follower.checks.observations import Observations, Picture
 from flock_follower.geometry import rotation_vector_to_matrix, Transform
 from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception import prints
@@ -95,16 +95,31 @@ def test_lying_marker_is_judged_by_its_body() -> None:
     assert prints.turned_print(pose, np.array([0.0, 0.0, -1.0]), Marker(0, SIDE, flat)) is None
 
 
-def test_check_counts_a_print_that_was_refused_as_misprint() -> None:
+def picture_of(code: Any) -> Picture:
+    """Return what check finds in an image of marker 0 with these cells."""
     marker = Marker(0, SIDE, TAIL)
     config = NeighborConfig('DICT_4X4_50', (MarkedNeighbor('leader', (marker,)),))
-    image = render(CAMERA, {0: facing((0.05, -0.05, 1.2), (0.15, 0.35, 0.05))},
-                   codes={0: printed('DICT_4X4_50', 0, 2)}, rays=3)
+    image = render(CAMERA, {0: facing((0.05, -0.05, 1.2), (0.15, 0.35, 0.05))}, codes={0: code},
+                   rays=3)
     collector = Collector(Observations(live=False), 1.0)
     collector.take('image_raw', '/image_raw', SimpleNamespace(
         width=320, height=240, encoding='mono8', step=320, is_bigendian=0, data=image.tobytes()),
         0.0)
     collector.finish(config)
     (picture,) = collector.observations.pictures
+    return picture
+
+
+@pytest.mark.parametrize(('code', 'reason'), [
+    (printed('DICT_4X4_50', 0, 2), prints.WRONG_BORDER),
+    (printed('DICT_4X4_50', 0)[:, ::-1], MIRRORED),
+    (~printed('DICT_4X4_50', 0), INVERTED)])
+def test_check_counts_a_print_that_was_refused_as_misprint(code: Any, reason: str) -> None:
+    picture = picture_of(code)
     assert not picture.markers
-    assert picture.misprints[0].reason == prints.WRONG_BORDER
+    assert picture.misprints[0].reason == reason
+
+
+def test_another_marker_is_no_mirrored_one() -> None:
+    picture = picture_of(printed('DICT_4X4_50', 7))
+    assert picture.markers and not picture.misprints
