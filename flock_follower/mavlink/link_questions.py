@@ -109,8 +109,8 @@ class LinkQuestions:
             name = parameter_question(message.param_id)
         elif kind == 'COMMAND_ACK' and self.is_addressed(message):
             self._any.answer(now)
-            # A rate that is refused is an answer, too; a refusal names no reasons.
-            done = message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or (
+            # A refusal is an answer, too; but a refused request for the reasons names none.
+            done = message.command != mavlink.MAV_CMD_RUN_PREARM_CHECKS or (
                 message.result == mavlink.MAV_RESULT_ACCEPTED)
             name = _command(message.command) if done else ''
         if name in self._questions:

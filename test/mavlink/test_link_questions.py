@@ -59,6 +59,10 @@ QUESTIONS = {
     'HOME_POSITION': (command(mavlink.MAV_CMD_REQUEST_MESSAGE, 242.0), HOME),
     REASONS: (command(mavlink.MAV_CMD_RUN_PREARM_CHECKS),
               ack(mavlink.MAV_CMD_RUN_PREARM_CHECKS)),
+    # A refused command is an answered one: ArduCopter refuses to arm with the throttle up.
+    'COMPONENT_ARM_DISARM': (
+        command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0),
+        ack(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_RESULT_FAILED)),
     'DO_SET_MODE': (command(mavlink.MAV_CMD_DO_SET_MODE, 1.0), ack(mavlink.MAV_CMD_DO_SET_MODE))}
 #: They arrive without a question, too.
 UNASKED = {'GPS_GLOBAL_ORIGIN', 'HOME_POSITION'}
