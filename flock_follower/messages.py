@@ -164,7 +164,7 @@ class OdometryState(NamedTuple):
     acceleration: Array | None = None
 
     def error_of_prediction(self, before: OdometryState, elapsed: float) -> Array:
-        """Return the position (3,), m, minus its prediction from ``elapsed`` s before."""
+        """Return the position (3,), m, less that predicted from ``elapsed`` s before."""
         return self.position - before.position - (
             0.5 * (before.velocity + self.velocity) * elapsed)
 

@@ -187,7 +187,7 @@ class Observations:
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     own: OwnMotion | None = None
     child_frame: str = ''
-    """The child frame of the newest ``odom``."""
+    """Of the newest ``odom``."""
     static_child: Transform | None = None
     """Pose of this frame on base_link by tf_static."""
     calibration: Any = None

@@ -127,9 +127,8 @@ def leapt(before: OdometryState, now: OdometryState) -> str:
     """
     Return the jump of an odometry between two of its states, as text, or ''.
 
-    This rule is separate from the rules for the ego odometry, for two reasons: states of other
-    vehicles may be seconds apart, so the motion between two states is allowed for; and a jump of
-    the yaw alone also rotates the frames against each other.
+    A rule of its own: states of other vehicles come seconds apart, so their motion in between is
+    allowed for, and a leap of the yaw alone turns the frames against each other, too.
     """
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
     if not 0.0 <= elapsed <= PREDICTION_TIME:

@@ -111,7 +111,7 @@ class Permission:
     received: float = math.inf
     """Time of the newest message with the mode since ``since``, s, if any."""
     obeyed: bool = False
-    """Whether the vehicle has been in the offboard mode since ``since``."""
+    """Whether the vehicle has been in the mode that obeys setpoints since then."""
     cause: Cause | None = Cause.NOT_REQUESTED
     """Why the permission is not ACTIVE, as a value; None if it is."""
     taker: Taker = UNKNOWN
@@ -180,7 +180,7 @@ class Permission:
             f'two nodes command: {who}', Cause.CONTESTED)
 
     def fall_silent(self, why: str) -> Permission:
-        """Stop sending, because no velocity is valid; the autopilot's failsafe then starts."""
+        """Stop sending, as no velocity is valid: only silence starts the failsafe."""
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
         return self._stop_sending(f'fell silent: {why}', Cause.SILENT) if self.streams else self
 

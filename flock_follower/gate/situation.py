@@ -15,9 +15,8 @@
 """
 The situation of one decision: all inputs of ``setpoint_rules.decide`` as one value.
 
-The gate collects its inputs in a ``Situation``; ``decide`` returns the setpoint for it.
-``to_json`` writes a situation as one line, ``from_json`` reads the line, so a decision can be
-repeated.
+The gate collects its inputs into a ``Situation``, and ``decide`` turns it into a setpoint.
+``to_json`` writes it as one line, ``from_json`` reads it: a decision can be made again.
 """
 
 from __future__ import annotations
@@ -115,7 +114,7 @@ class Situation:
 
     @classmethod
     def from_json(cls, line: str) -> Situation:
-        """Return the situation in a line of ``to_json``, equal bit for bit."""
+        """Return the situation of a line of ``to_json``; equal bit for bit, arrays as arrays."""
         situation: Situation = _read_value(cls, json.loads(line))
         return situation
 

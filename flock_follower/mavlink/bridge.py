@@ -362,11 +362,11 @@ class Bridge:
         """
         Send the final messages.
 
-        A vehicle that still flies our setpoints receives a hold command. If a pending request ends
-        the flight (a landing, or the pilot's mode after a moved stick), its command is sent again
-        instead. While the mode is unknown, no command is sent. The last message is a level
-        setpoint, because autopilots obey it for up to seconds: a braking setpoint would make the
-        vehicle fly backwards after it has stopped.
+        A vehicle that still flies our setpoints receives a hold command, or again the one by which
+        a pending request ends the flight: a landing, or the pilot's mode after a stick was moved;
+        none while its mode is unknown. The last message is a level setpoint, because autopilots
+        obey it for up to seconds: after that time a braking one would make the vehicle fly
+        backwards.
         """
         # While the line is silent, or the mode unknown, the pilot may have taken over.
         if self.telemetry.dialect is not None and self.gate.flies and (

@@ -133,8 +133,8 @@ def has_jumped(before: OdometryState, then: float, after: OdometryState, now: fl
     """
     Return whether a pose differs from its prediction from ``then``, s, or time decreased.
 
-    This rule is less sensitive than that of ``derivation``, because each jump counted here resets
-    the autopilot's estimate.
+    A rule of its own: each jump that is counted resets the autopilot's estimate, so the small
+    steps by which ``derivation`` restarts its filter must not count.
     """
     dt = now - then
     position_error = after.error_of_prediction(before, dt)

@@ -117,8 +117,8 @@ class OdometrySource:
     """
     The ego odometry, message by message.
 
-    ``twist`` describes the frame of the velocity. ``events`` has a pair (reason, detail) for each
-    dropped message and each jump since :meth:`new_events`.
+    ``twist`` describes the frame of the velocity.
+    ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
     """
 
     def __init__(self, params: SourceParams | None = None) -> None:

@@ -205,13 +205,14 @@ class Sighting:
     """
     The result of one image.
 
-    ``estimates`` and ``measurements`` have the neighbors measured in this image, by name.
-    ``poses`` are the measured poses with a plausible attitude. ``stage`` is the costliest stage of
-    detection that was used; 'none' if the image could not be used, or no neighbor was searched.
-    ``rejections`` has a pair (reason, detail) for each rejected measurement; ``other_ids`` are the
-    ids of markers of no neighbor. ``duplicates`` are the states of measured candidates that are
-    not the primary track, by names made of the neighbors' names. ``misprints``: by neighbor's
-    name, why a detected marker was refused.
+    ``estimates`` and ``measurements`` by neighbor's name, of the neighbors measured in this
+    image; ``poses`` are the measured ones, except those whose attitude was not plausible;
+    ``stage`` is the costliest stage of detection that was used, 'none' if the image could
+    not be used or no neighbor was to be detected in it. ``rejections`` are (reason, detail), one
+    for each thing dropped; ``other_ids`` are the ids of markers of no neighbor. ``duplicates``,
+    by names made of the neighbors', are the states of candidates measured in this image that
+    carry a neighbor's marker and are not its primary track. ``misprints``: why the marker of a
+    neighbor, by its name, was found and refused.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)

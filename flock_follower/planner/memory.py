@@ -302,7 +302,7 @@ def max_age(n: Neighbor, params: PlannerParams) -> float:
 
 
 def prediction_error(now: Moving, before: Moving) -> float:
-    """Return the distance, m, of a state from its prediction with the previous state."""
+    """Return the distance of a state from its prediction by the state before, m."""
     elapsed = now.stamp - before.stamp
     return math.dist(now.position.tolist(), [x + elapsed * v for x, v in zip(
         before.position.tolist(), before.velocity.tolist())])

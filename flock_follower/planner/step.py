@@ -56,8 +56,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param now: a step back by more than 0.1 s forgets everything.
     :param engaged: whether commands are requested; :param own: the newest odometry, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
-    :param looked: time of the last processed image, s; None before the first, which is no fault.
-    :param waiting: reason why the planner may not command, or why it was disengaged, or ''.
+    :param looked: when the last image was processed, s; None if none was: that is no fault.
+    :param waiting: reason why it may not command, or why it was disengaged, or ''.
     :param view: of the cameras; () if unknown; :param ground: height at arming, m, in odom.
     :param frames: stamps of the newest processed images, s, in their order.
     """

@@ -35,11 +35,10 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     """
     Restrict Fast DDS to UDP; call this before ``rclpy.init`` with ``os.environ``.
 
-    When Fast DDS 2.14 first sends to another process, it tests the shared-memory port of that
-    process, sometimes for 333 ms; if the process was killed, for 1 s. Meanwhile the publisher
-    waits and holds the GIL, so the whole process stops (eProsima/Fast-DDS issue 6535). Other
-    middleware, and the user's own settings, are not changed; ``shared_memory_size`` shows the
-    result.
+    When it first sends to another process, Fast DDS 2.14 tests the shared-memory port of that
+    process, sometimes for 333 ms, for 1 s if it was killed. A publisher waits meanwhile and holds
+    the GIL: the whole process stops (eProsima/Fast-DDS issue 6535). Other middleware, and the
+    user's own settings, are left as they are; ``shared_memory_size`` shows the result.
 
     :param environment: changed in place.
     """
