@@ -247,7 +247,7 @@ class Gate:
 
     @property
     def wind(self) -> float:
-        """Return the acceleration by wind that the setpoints offset, m/s^2."""
+        """Return the acceleration by the wind that setpoints offset, m/s^2."""
         offset = self._disturbance.offset(self.autopilot.needs_wind_offset)
         return float(np.linalg.norm(offset[:2]))
 

@@ -361,6 +361,8 @@ FAULTS: list[Fault] = [
     Fault('few on a busy computer', LIVE, UNMEASURED, 'odom rate', '10.0 Hz', '',
           together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0)),
                    machine(load=Load(0.2, 3.0, 4)))),
+    Fault('few images on a busy computer', LIVE, UNMEASURED, 'images rate', '2.0 Hz', '',
+          together(kept('image_raw', slice(None, None, 15)), machine(load=Load(0.2, 3.0, 4)))),
     Fault('another clock on a busy computer', LIVE, ERROR, 'odom latency', 'or another clock',
           'set use_sim_time', together(delayed('odom', 100.0), machine(load=Load(0.2, 3.0, 4)))),
     Fault('nodes on another computer', LIVE, UNMEASURED, 'processor', 'do not run on this', '',
