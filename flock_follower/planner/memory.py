@@ -298,4 +298,3 @@ def update_pending(memory: Memory, command: Array, elapsed: float, params: Plann
 def max_age(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
     return params.heard_timeout if n.received else params.predict_timeout
-
