@@ -134,7 +134,7 @@ class World:
 
     @property
     def positions(self) -> Array:
-        """Return the true positions (n, m + 1, 3), m, the leader first."""
+        """Return the true positions, (n, m + 1, 3), m, the leader first."""
         return self._all(self._leader[self.step], self.vehicle.position)
 
     @property

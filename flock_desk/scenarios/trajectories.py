@@ -85,7 +85,7 @@ class Track:
             position, slerp(self.quaternions[i], self.quaternions[i + 1], f))
 
     def velocity(self, time: float) -> Array:
-        """Return the velocity (3,), m/s, in odom at a time within the track, s."""
+        """Return the velocity, (3,), m/s, in odom at a time within the track, s."""
         return self._interpolate(self.velocities, time)
 
     def rate(self, time: float) -> Array:

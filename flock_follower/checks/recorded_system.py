@@ -54,7 +54,7 @@ DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: The topics to take, and their types.
 TOPIC_TYPES: Final = {**{name: TYPES[name] for name in (*_IMAGES, 'odom', 'camera_info')},
-               DIAGNOSTICS: 'diagnostic_msgs/msg/DiagnosticArray'}
+                      DIAGNOSTICS: 'diagnostic_msgs/msg/DiagnosticArray'}
 
 
 def judge_all(seen: Observations) -> list[Finding]:

@@ -92,7 +92,7 @@ class MotionSources:
 
     @property
     def position(self) -> Array | None:
-        """Return the position (3,), m, by the source, without its jumps; None if unknown."""
+        """Return the position, (3,), m, by the source, without its jumps; None if unknown."""
         position = self._sources[self.source].path.position
         return None if position is None else position + self._handed_on
 

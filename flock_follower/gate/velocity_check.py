@@ -334,7 +334,7 @@ class Path:
         return (self._kept[0][0], self._kept[-1][0]) if self._kept else (math.inf, -math.inf)
 
     def displacement(self, start: float, end: float) -> Array:
-        """Return the displacement (3,), m, from one time within the span to another."""
+        """Return the displacement, (3,), m, from one time within the span to another."""
         return self._place_at(end) - self._place_at(start)
 
     def _place_at(self, time: float) -> Array:

@@ -255,7 +255,6 @@ class PoseSources:
             yield stamp_ns
 
 
-
 def _attitude(source: PoseSource, state: PoseState) -> Array | str:
     """Return the attitude (x, y, z, w) of a pose, or why it is invalid."""
     if source.position_only:

@@ -346,7 +346,7 @@ def descend(image: GrayImage, camera: CameraModel, model: SmearModel, start: Sme
 
 
 def _look_again(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
-                  before: _Linear) -> _Linear | None:
+                before: _Linear) -> _Linear | None:
     """Return what the image shows after a short step, with the slopes of the print before."""
     seen = _look(image, camera, _basis(start.pose, model), model.places)
     return None if seen is None else before._replace(

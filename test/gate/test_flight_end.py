@@ -58,7 +58,7 @@ def reason(end=None, active_since=10.0, command_time=NEVER, handover='', now=20.
 def test_engage_timeout_before_first_command_then_3_s(
         options, at, why, action):
     end = FlightEnd(EndParams(leader_lost_action=action, **options))
-    assert reason(end, **at) [:2] == (why, action if why else HOLD)
+    assert reason(end, **at)[:2] == (why, action if why else HOLD)
     # What the gate finds goes first and is held.
     assert reason(end, handover='height 0.2 m', **at)[:2] == ('height 0.2 m', HOLD)
 

@@ -163,6 +163,7 @@ def test_image_shows_its_own_estimate_else_one_carried_to_it() -> None:
     for k in range(3):
         made.take_neighbor(state(position=(2.0 + 0.1 * k, 0.0, 0.0), velocity=(1.0, 0.0, 0.0),
                                  stamp=k * 10**8), NOW)
+
     def drawn(stamp: float) -> tuple[float, str]:
         (box,) = (one for one in made.picture_scene(round(stamp * 1e9)) if one.kind == BOX)
         return float(np.asarray(box.position)[0]), box.paint
