@@ -124,7 +124,7 @@ _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Further places at which a cell is read, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
 #: Excess of errors in the middles of the cells from which on no other places are read.
-_MAX_EXCESS = 2.0
+_MAX_EXCESS = 3.0
 _MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
 _MOST_HIDDEN_TRACKED = 0.4  # share of the inner cells of a tracked marker that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
