@@ -61,7 +61,7 @@ ROOMS = {
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'gate': ('bridge_state command_messages messages planner', 'numpy'),
     'mavlink': ('bridge_state gate messages ned odometry parameters', 'numpy pymavlink'),
-    'bags': ('parameters', 'mcap numpy rosbags yaml'),
+    'bags': ('parameters', 'backports compression mcap numpy rosbags yaml'),
     'flight_parameters': ('mavlink parameters perception planner', ''),
     'checks': ('bags bridge_state messages neighbors_file odometry parameters perception '
                'pose_messages topic_names', 'cv2 numpy'),

@@ -57,7 +57,8 @@ def check_pictures(seen: Observations) -> Iterator[Finding]:
     good = [picture for picture in seen.pictures if not picture.fault]
     if faults := [picture.fault for picture in seen.pictures if picture.fault]:
         yield Finding(ERROR, 'images', faults[0], 'an encoding that can be read',
-                      'set the format of the camera driver to mono8, rgb8 or bgr8')
+                      'set the format of the camera driver to mono8, rgb8 or bgr8; compressed '
+                      'images must be whole JPEG or PNG files')
     if seen.calibration is not None:  # else it is reported as a missing topic
         yield _calibration(seen, good)
     if good:

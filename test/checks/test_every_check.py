@@ -277,7 +277,7 @@ FAULTS: list[Fault] = [
     Fault('a calibration without a matrix', BOTH, ERROR, 'calibration', 'K = 0',
           'calibrate the camera',
           change(lambda seen: seen.calibration, k=[0.0] * 9)),
-    Fault('an encoding nobody reads', BOTH, ERROR, 'images', "encoding = '16UC1'", 'mono8',
+    Fault('an encoding nobody reads', BOTH, ERROR, 'images', "encoding = '16UC1'", 'JPEG',
           pictures(fault="encoding = '16UC1': must be one of mono8, ...")),
     Fault('a cap before the lens', BOTH, ERROR, 'images', 'black', 'take off the cap',
           pictures(brightness=3.0, contrast=1.0, markers={})),
