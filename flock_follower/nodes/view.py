@@ -115,7 +115,7 @@ class View(FlockNode):
         self._configure(CameraValues(''), 'raw', SourceParams())
         self._buttons: deque[str] = deque(maxlen=4)
         self._calls: list[tuple[str, Any, float]] = []
-        """Each button that was pressed, the future of its answer, and when none is awaited."""
+        """Each pressed button, the future of its answer, and the time until which it waits."""
         self._callers = {
             button: self.create_client(Trigger if value is None else SetBool, service)
             for button, (service, value) in CALLS.items()} if values['control'] else {}

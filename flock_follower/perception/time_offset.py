@@ -220,7 +220,7 @@ class MountedCamera:
         self.noise.restart()
         self.time_offset.restart()
         self.searched = self.swept = -math.inf
-        """Stamps of the last searches of the whole image, s: with, without missing neighbor."""
+        """Stamps, s, of the last search for a missing neighbor, and of the last without one."""
         self.vain: dict[str, float] = {}
         """Time, on the odometry's clock, of the last search without success, s."""
         self.newest = -math.inf
