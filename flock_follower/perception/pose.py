@@ -273,7 +273,7 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
     for start in starts:
         found = fit_smeared(image, camera, sought.smears[index], start)
         if found is not None:
-            return _of_smears(image, camera, sought, _Whole(index, found), expected, None)
+            return _of_smears(image, camera, sought, _Whole(index, found), expected, None, True)
     return None
 
 
@@ -350,12 +350,14 @@ def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
 
 
 def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Whole,
-               expected: PosePrior, last: Measurement | None) -> Measurement:
+               expected: PosePrior, last: Measurement | None,
+               detected: bool = False) -> Measurement:
     """
     Return the measurement of the likelier attitude: of a fit, or of its mirrored one.
 
     :param last: the last measurement, if any: if its print was smeared, the mirrored attitude can
         wait for an image with steps left.
+    :param detected: whether the marker was just detected: then a lone fit is in doubt.
     """
     index, fitted = found
     start = _mirrored_body(sought, index, fitted.pose)
@@ -364,10 +366,10 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Wh
     other = None if start is None or steps < 1 else descend(
         image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True,
         steps)
-    if start is not None and other is None:
-        return _with_doubt(sought, found, last)
+    if start is not None and other is None and (can_wait or detected):
+        return _with_doubt(sought, found, last, detected)
     # Little smear leaves edges: if they do not fit, something covers a part of the print.
-    covered = last is None and fitted.blur < PLAIN_BLUR
+    covered = detected and fitted.blur < PLAIN_BLUR
     return _choose_smeared(sought, index, [fitted] if other is None else [fitted, other], expected,
                            UNRIVALED_DOUBT if covered else 0.0)
 
@@ -395,12 +397,13 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
     return mix_poses(_smear_measurement(sought, index, best.chosen.fit), best)
 
 
-def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Measurement:
+def _with_doubt(sought: Target, found: _Whole, last: Measurement | None,
+                detected: bool = False) -> Measurement:
     """Return a smeared marker's measurement; the mirrored attitude keeps its last probability."""
     pose = found.fit.pose
     measurement = _smear_measurement(sought, found.number, found.fit)
     other = _mirrored_body(sought, found.number, pose)
-    if other is None:
+    if other is None or (last is None and not detected):
         return measurement
     doubt = UNRIVALED_DOUBT if last is None else last.doubt
     if last is not None and angle(other, last.T_camera_body) < angle(pose, last.T_camera_body):
