@@ -346,8 +346,8 @@ def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
     in_place = found.found & (last.squares < max(MAX_INLIER_ERROR**2, 9.0 * square))
     inlier_share, rms = np.count_nonzero(in_place) / len(lines.model), math.sqrt(square)
     covariance = normal_covariance(last.information)
-    max_rms = max(MAX_RMS, _MAX_RMS_SHARE * min(lines.narrowest))
-    if covariance is None or not (inlier_share > MIN_INLIER_SHARE and rms < max_rms):
+    if covariance is None or not (inlier_share > MIN_INLIER_SHARE and (
+            rms < max(MAX_RMS, _MAX_RMS_SHARE * min(lines.narrowest)))):
         return None
     weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(

@@ -393,8 +393,8 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
     least = min(each.rms for each in fits)
     best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
                    for each in fits], PosePrior(None, expected.up))
-    best = best._replace(share=max(best.share, least_doubt))
-    return mix_poses(_smear_measurement(sought, index, best.chosen.fit), best)
+    return mix_poses(_smear_measurement(sought, index, best.chosen.fit),
+                     best._replace(share=max(best.share, least_doubt)))
 
 
 def _with_doubt(sought: Target, found: _Whole, last: Measurement | None,

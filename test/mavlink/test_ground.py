@@ -50,4 +50,5 @@ def test_landed_report_near_ground_ends_permission_after_1_s(height):
         control.take_status(OURS, now, airborne=k < 20)
         ended.append(control.decide(now)[0].kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
-    assert control.permission == Permission(reason='on the ground', cause=Cause.LANDED)
+    assert control.permission == Permission(
+        reason='on the ground', received=control.permission.received, cause=Cause.LANDED)
