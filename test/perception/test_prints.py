@@ -113,7 +113,8 @@ def picture_of(code: Any) -> Picture:
 @pytest.mark.parametrize(('code', 'reason'), [
     (printed('DICT_4X4_50', 0, 2), prints.WRONG_BORDER),
     (printed('DICT_4X4_50', 0)[:, ::-1], MIRRORED),
-    (~printed('DICT_4X4_50', 0), INVERTED)])
+    # Its margin is inverted, too: OpenCV 4.6 does not find it in a white one.
+    (np.pad(~printed('DICT_4X4_50', 0), 1), INVERTED)])
 def test_check_counts_a_print_that_was_refused_as_misprint(code: Any, reason: str) -> None:
     picture = picture_of(code)
     assert not picture.markers
