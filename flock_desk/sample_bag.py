@@ -226,7 +226,7 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     if out.exists() and not (out / 'metadata.yaml').is_file():
         raise BagError(f'{out}: exists and is not a bag: not replaced')
     out.parent.mkdir(parents=True, exist_ok=True)
-    recording = _recording(variant, seed)
+    recording = _make_recording(variant, seed)
     count = len(recording.image_stamps_ns)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix='.writing-') as scratch:
         images = computed(partial(_render_images, variant, seed), range(count), jobs)
@@ -239,12 +239,15 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
         shutil.move(str(Path(scratch) / out.name), out)
 
 
-_recording = lru_cache(maxsize=1)(Recording)  # one in each process that renders
+@lru_cache(maxsize=1)
+def _make_recording(variant: Variant, seed: int) -> Recording:
+    """Return the recording; once in each process that renders."""
+    compute_in_one_thread()
+    return Recording(variant, seed)
 
 
 def _render_images(variant: Variant, seed: int, k: int) -> BagMessage:
-    compute_in_one_thread()
-    return _recording(variant, seed).image(k)
+    return _make_recording(variant, seed).image(k)
 
 
 def _count_images(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
