@@ -78,6 +78,8 @@ class Flight(SteppedAutopilot):
         self.odom_yaw = odom_yaw
         self.odom_error = np.zeros(3)
         """By how much the velocity of the odometry is wrong, m/s."""
+        self.odom_displacement = None
+        """By how much its position is wrong, m: it follows the velocity. None: not reported."""
         self.modes = MODES[personality]
         self.received = []
         self.cycles = []
@@ -93,12 +95,18 @@ class Flight(SteppedAutopilot):
             self.wire.arrived += answers
             self.bridge.receive(now)
             velocity = self.vehicle.velocity + self.odom_error
+            position = None
+            if self.odom_displacement is not None:
+                self.odom_displacement = self.odom_displacement + STEP_TIME * self.odom_error
+                position = self.vehicle.position + self.odom_displacement
             if self.odometry:
                 self.bridge.gate.take_motion('odom', MotionReport(
-                    velocity, self.vehicle.yaw + self.odom_yaw), 0.0, now)
+                    velocity, self.vehicle.yaw + self.odom_yaw, position), 0.0, now)
             if self.forwards and self.steps % 2 == 0:
                 self.bridge.forward(OdometryState(
-                    0, 'odom', 'base_link', self.vehicle.position.copy(), self.vehicle.quaternion,
+                    0, 'odom', 'base_link', (
+                        self.vehicle.position.copy() if position is None else position),
+                    self.vehicle.quaternion,
                     velocity, self.vehicle.angular_velocity, 0.01 * np.eye(6), 0.01 * np.eye(6),
                     np.eye(3)), now, now)
                 self.bridge.send_odometry(now)

@@ -31,7 +31,7 @@ ARDUCOPTER_MODES = {'STABILIZE': (0, 0), 'GUIDED': (4, 0), 'LOITER': (5, 0),
 BLIND = {
     'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
     'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
-        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
+        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'POSZ', 'VELXY', 'VELZ', 'YAW')}}}
 
 
 def setpoint(east=0.0, north=0.0, up=0.0, *, mask=MASK_YAW, yaw=0.0, frame=1, target=1):

@@ -106,9 +106,10 @@ class FlightController(ABC):
         """Texts for STATUSTEXT; the owner empties it."""
         self.wind: Array = np.zeros(3)
         """Velocity of the air (3,), m/s, ENU."""
+        height, vision = self.PROFILE.vision_height
         self.estimator = Estimator(vehicle, self.PROFILE, all(
             parameters[name] == value for name, value in self.PROFILE.vision.items()),
-            now, ready_at)
+            parameters[height] == vision, now, ready_at)
         self.has_origin = not self.estimator.uses_vision
         """Whether it has a global origin: by GPS, or by SET_GPS_GLOBAL_ORIGIN."""
         self.home: Array = vehicle.position * [1.0, 1.0, 0.0]

@@ -102,6 +102,8 @@ class Profile:
     """MAV_RESULT of SET_MESSAGE_INTERVAL for a message that it does not send."""
     vision: Mapping[str, float]
     """The values of parameters with which it flies by vision instead of GPS."""
+    vision_height: tuple[str, float]
+    """The parameter, and its value, with which vision is its height sensor."""
     frames: tuple[int, ...]
     """The frames of ODOMETRY that it takes."""
     oldest_vision: float
@@ -195,7 +197,7 @@ PX4: Final = Profile(
            mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5, mavlink.MAVLINK_MSG_ID_CURRENT_MODE: 0.5},
     mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, arming=('permission', 'armable'),
     refused=mavlink.MAV_RESULT_TEMPORARILY_REJECTED, unknown_message=mavlink.MAV_RESULT_FAILED,
-    vision={'EKF2_GPS_CTRL': 0},
+    vision={'EKF2_GPS_CTRL': 0}, vision_height=('EKF2_HGT_REF', 3),
     frames=(mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD),
     oldest_vision=0.2, position_timeout=0.2, reports_for=math.inf,  # EKF2_DELAY_MAX
     estimator_flags={'always': 0x65, 'at rest': 0x80, 'position': 0xA, 'aided': 0x100,
@@ -248,7 +250,7 @@ ARDUCOPTER: Final = Profile(
            mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.0},
     mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, arming=('permission', 'vision', 'armable'),
     refused=mavlink.MAV_RESULT_FAILED, unknown_message=mavlink.MAV_RESULT_DENIED,
-    vision={'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6},
+    vision={'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6}, vision_height=('EK3_SRC1_POSZ', 6),
     frames=(mavlink.MAV_FRAME_LOCAL_FRD,),
     oldest_vision=math.inf, position_timeout=7.1, reports_for=14.5,
     estimator_flags={'always': 0x25, 'position': 0x31A, 'unreported': 0x82},

@@ -88,6 +88,11 @@ class DisturbanceObserver:
         up = min(max(up, -THRUST_OFFSET_MAX), THRUST_OFFSET_MAX)
         return np.array([east, north, up] if wind else [0.0, 0.0, up])
 
+    @property
+    def expected_climb(self) -> float | None:
+        """Return the expected vertical acceleration, m/s^2; None if not known."""
+        return None if self._velocity is None else float(self._response[2] + self.acceleration[2])
+
     def step(self, sent: Array | None, velocity: Array | None, now: float) -> None:
         """
         Update the estimate to ``now``, s.

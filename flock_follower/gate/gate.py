@@ -32,7 +32,8 @@ from numpy.typing import ArrayLike
 from flock_follower.command_messages import Command, ODOMETRY_GAP
 from flock_follower.gate import disturbance, envelope, setpoint_rules
 from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
-from flock_follower.gate.envelope import GateLimits, HeightEstimator, Location
+from flock_follower.gate.envelope import GateLimits, Location
+from flock_follower.gate.height import HeightEstimator, STEP_TIME
 from flock_follower.gate.motion_sources import MotionSources, onset
 from flock_follower.gate.obstacle import Refusal
 from flock_follower.gate.permission import Permission, Phase
@@ -214,9 +215,11 @@ class Gate:
         velocity = None if self.relative.reckoning else self.motion.best_velocity(
             self.limits, now)
         refused = self.heights.take(altitude, None if velocity is None else float(
-            velocity.vector[2]), now, sensor)
+            velocity.vector[2]), now, sensor, self._disturbance.expected_climb)
         height = self.heights.altitude(now)
-        if self.heights.stepped == now and now - self.heights.leapt <= envelope.STEP_TIME:
+        # The autopilot obeys with the velocity that was forwarded, which has no such error.
+        self.motion.climb_rate_error = self.corrected_climb_rate(0.0, now) * self.autopilot.fused
+        if self.heights.stepped == now and now - self.heights.leapt <= STEP_TIME:
             # Not the odometry: its velocity errs more slowly.
             self.motion.forget_heights()
         if not refused and height is not None:

@@ -66,6 +66,8 @@ class MotionSources:
     """
 
     def __init__(self, choice: str) -> None:
+        self.climb_rate_error = 0.0
+        """Error of the vertical velocity of odom by the barometer, m/s; 0 if not to be removed."""
         self.displaced: Refusal | None = None
         """The difference of the displacements of both sources as a text, if they differ."""
         self._choice = choice
@@ -161,9 +163,12 @@ class MotionSources:
         """Return the known motion at ``now``, s."""
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
         _, yaw_time = odom.yaw()
+        by_odom = odom.motion(now)
+        by_odom = by_odom._replace(
+            velocity=by_odom.velocity + np.array([0.0, 0.0, self.climb_rate_error]))
         # Compared at the same time: at 1 rad/s odometry 0.25 s late would differ by 0.25 rad.
         return known_motion(
-            limits, odom.motion(now), autopilot.motion(now, yaw_time), source=self.source,
+            limits, by_odom, autopilot.motion(now, yaw_time), source=self.source,
             disagreeing_for=self._comparison.disagreeing_for(now),
             distrusted_for=now - self._distrusted_since)
 

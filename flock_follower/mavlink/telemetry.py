@@ -27,7 +27,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.gate.envelope import pressure_altitude
+from flock_follower.gate.height import pressure_altitude
 from flock_follower.gate.permission import MODE_TIMEOUT
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.geometry import (

@@ -66,6 +66,20 @@ def test_the_estimate_follows_the_vision_even_if_it_is_wrong(personality):
         math.pi / 2 - flight.vehicle.yaw - 0.5, abs=0.05)
 
 
+@pytest.mark.parametrize(('personality', 'barometer'), [
+    ('px4', {'EKF2_HGT_REF': 0}), ('arducopter', {'EK3_SRC1_POSZ': 1})])
+def test_height_by_barometer_follows_velocity_of_vision(personality, barometer):
+    flight = Flight(personality, parameters={**BLIND[personality], **barometer})
+    flight.fly(1.0, seen(flight, error=(0.0, 0.0, 0.5)), rate=30.0)
+    before = flight.last('LOCAL_POSITION_NED').z + flight.vehicle.position[2]
+    assert abs(before) < 0.05  # not its height
+    flight.fly(5.0, lambda: odometry(flight.vehicle.position, (
+        flight.vehicle.rotation.T @ (flight.vehicle.velocity - [0.0, 0.0, 0.3])),
+        yaw=flight.vehicle.yaw), rate=30.0)
+    after = flight.last('LOCAL_POSITION_NED').z + flight.vehicle.position[2]
+    assert after - before == pytest.approx(1.4, abs=0.1)  # as on both real autopilots
+
+
 def test_jump_is_outlier_unless_reset_counter_announces_it():
     flight, away = Flight(parameters=BLIND['px4']), np.array([5.0, 0.0, 0.0])
     flight.fly(1.0, seen(flight), rate=30.0)

@@ -220,7 +220,7 @@ def test_a_jump_of_the_sensor_alone_is_no_displacement(height, climb, end):
         gate.take_command(Command(FORWARD, 1.0), 0.0, now)
         decide(gate, now)
         handovers.append(gate.handover(now))
-    assert gate.heights.stepped > 14.0
+    assert (gate.heights.stepped > 14.0) == bool(height)  # else odometry has stepped
     assert next(filter(None, handovers), '').startswith(end) and bool(end) == any(handovers)
     assert not any(handovers[:81])
 

@@ -26,6 +26,7 @@ from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.global_origin import NO_HEIGHT
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
+from flock_follower.planner.limits import limit_norm
 
 pytestmark = pytest.mark.slow
 
@@ -72,6 +73,27 @@ def test_forwarded_climb_is_corrected_by_barometer():
         reported = [m for _, m in flight.received if m.get_type() == 'ODOMETRY'][-1]
         errors.append(-reported.vz - flight.vehicle.velocity[2])  # it is almost level
     assert np.mean(errors) == pytest.approx(0.0, abs=0.1)
+
+
+@BOTH
+@pytest.mark.parametrize(('step', 'seconds', 'least', 'most'), [
+    (0.5, 0.0, 0.7, 2.0), (1.0, 0.0, 1.3, 2.0), (-3.0, 0.0, 1.9, 2.4), (2.0, 0.5, 0.35, 2.0)])
+def test_diverging_climb_of_fused_odometry_ends_flight_in_time(
+        personality, step, seconds, least, most):
+    """The vehicle, which held the wrong velocity, was on the ground after 2 s."""
+    flight = forwarding(Flight(personality, **without_gps(personality)))
+    flight.odom_displacement = np.zeros(3)
+    flight.engage()
+    begun, heights = flight.now + 3.0, []
+    while flight.now < begun + 7.0:
+        part = (flight.now - begun) / max(seconds, 1e-3)
+        flight.odom_error[2] = step * min(max(part, 0.0), 1.0)
+        flight.planner = limit_norm(-2.0 * (flight.vehicle.velocity + flight.odom_error), 2.0)
+        flight.fly(0.1)
+        if flight.bridge.gate.permission.streams:
+            heights.append(flight.vehicle.position[2])
+    assert not flight.bridge.gate.permission.streams
+    assert least < min(heights) and max(heights) < most
 
 
 @pytest.mark.parametrize(('personality', 'action'), [

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.gate.envelope import (
+from flock_follower.gate.height import (
     HEIGHT_TIMEOUT,
     HeightEstimator,
     MAX_CORRECTION,
@@ -167,6 +167,40 @@ def test_barometer_jump_corrects_climb_by_its_bound_at_most():
         now = k * PERIOD
         heights.take(2.0 + (30.0 if k >= 40 else 0.0) + 5.0 * max(now - 2.0, 0.0), 0.0, now)
         assert abs(heights.correct(0.0, now)) <= MAX_CORRECTION
+
+
+@pytest.mark.parametrize('seconds', [0.0, 0.4])
+@pytest.mark.parametrize('step', [1.0, -1.0, 3.0])
+def test_step_that_no_setpoint_explains_is_error_of_its_source(step, seconds):
+    rng, heights = np.random.default_rng(2), HeightEstimator()
+    for k in range(320):  # the vehicle hovers
+        now = k * PERIOD
+        part = min(max(now - 10.0, 0.0) / seconds, 1.0) if seconds else float(now > 10.0)
+        heights.take(100.0 + NOISE * rng.normal(), step * part, now, acceleration=0.0)
+        if k == 40:
+            heights.refer(0.0, now)
+        if now > 10.3 + 2.0 * seconds:  # beyond MAX_CORRECTION, too
+            assert heights.correct(step, now) == pytest.approx(0.0, abs=0.35)
+        assert heights.height(now) is None or abs(heights.height(now)) < 0.2
+    assert heights.stepped == -math.inf
+
+
+@pytest.mark.parametrize('acceleration', [2.0, -2.0])
+def test_steady_source_is_not_blamed_if_setpoints_are_not_flown(acceleration):
+    heights = HeightEstimator()
+    for k in range(100):
+        heights.take(100.0, 0.0, k * PERIOD, acceleration=acceleration)
+        assert heights.correct(0.0, k * PERIOD) == 0.0
+
+
+def test_climb_that_setpoints_explain_is_no_error_of_its_source():
+    heights, rate = HeightEstimator(), 0.0
+    for k in range(100):
+        acceleration = 2.5 if 40 <= k < 50 else 0.0
+        rate += PERIOD * acceleration
+        heights.take(100.0 + max(k - 45, 0) * PERIOD * rate, rate, k * PERIOD,
+                     acceleration=acceleration)
+    assert heights.correct(rate, 99 * PERIOD) == pytest.approx(rate, abs=0.05)
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
