@@ -121,6 +121,8 @@ class Permission:
     """While TAKEN_OVER, who changed the mode; after a moved stick STICK, until a request."""
     left_for: str = ''
     """While TAKEN_OVER, the mode that was flown instead."""
+    mode: str = ''
+    """While TAKEN_OVER, the newest mode: the pilot may switch again."""
 
     @property
     def streams(self) -> bool:
@@ -219,7 +221,7 @@ class Permission:
         """End a flight after the pilot or the autopilot has changed the mode."""
         return Permission(Phase.TAKEN_OVER, _left_reason(status.mode, taker),
                           received=self.received, cause=Cause.TAKEN, taker=taker,
-                          left_for=status.mode)
+                          left_for=status.mode, mode=status.mode)
 
     def name_taker(self, taker: Taker, now: float) -> Permission:
         """Set who took over, known at ``now``, s; the wait after a pilot begins at ``now``."""
@@ -236,6 +238,8 @@ class Permission:
         :param airborne: whether the vehicle reports that it flies: on the ground setpoints could
             start a take-off. None: no report, so nothing is permitted.
         """
+        if self.phase is Phase.TAKEN_OVER and self.taker.pilot and status.mode != self.mode:
+            return replace(self, received=received, mode=status.mode)
         if not (self.streams or self.unseen) or received <= self.since:
             return self
         now = replace(self.follow_silence(received - self.received), received=received)
