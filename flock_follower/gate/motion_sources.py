@@ -49,6 +49,11 @@ from flock_follower.gate.velocity_check import (
 )
 from flock_follower.geometry import Array
 
+#: Mean age of odometry at decisions, s, above which it is late. At 0.2 s the height of an ArduCopter
+#: that fused it swung more and more.
+LATE_AGE: Final[float] = 0.15
+#: Share of each decision in that mean: 5 s at 20 Hz.
+AGE_SHARE: Final[float] = 0.01
 VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 
 
@@ -74,6 +79,7 @@ class MotionSources:
         self._sources = {ODOM: Source(), AUTOPILOT: Source()}
         self._height_path = Path()
         self._handed_on: Array | float = 0.0  # m, from the position of odom to the path followed
+        self._mean_age = 0.0
         self._comparison = VelocityComparison()
         self._distrusted_since = math.inf
         self._displaced_since = math.inf
@@ -184,6 +190,9 @@ class MotionSources:
         self._distrusted_since = onset(self._distrusted_since, distrusted, now)
         known, before = self.known_motion(limits, now), self._comparison.disagreeing_for(now)
         self._comparison.take(known.difference, limits.velocity_tolerance, engaged, now)
+        age = now - self._sources[ODOM].velocity_time if engaged and math.isfinite(
+            self._sources[ODOM].velocity_time) else 0.0
+        self._mean_age += AGE_SHARE * (age - self._mean_age)
         # An estimate that rests on our odometry, or on no sensor, is no evidence.
         proves = not fused and not distrusted
         self.displaced = None if known.source != ODOM else find_displacement(
@@ -197,6 +206,12 @@ class MotionSources:
     def displaced_too_long(self, now: float) -> bool:
         """Return whether displacements have differed for so long that the vehicle must stop."""
         return now - self._displaced_since > DISPLACED_HANDOVER_TIME
+
+    def lateness(self) -> str:
+        """Return that odometry is late at the decisions of this flight, or ''."""
+        return '' if self._mean_age <= LATE_AGE else (
+            f'odometry is {self._mean_age:.2f} s old when setpoints are decided, above '
+            f'{LATE_AGE:g} s: the height can swing; end other programs, or reduce its latency')
 
     def contradiction(self, limits: GateLimits, now: float) -> str:
         """Return the contradiction between odom and the autopilot as text, or ''."""

@@ -225,6 +225,17 @@ def test_a_jump_of_the_sensor_alone_is_no_displacement(height, climb, end):
     assert not any(handovers[:81])
 
 
+@pytest.mark.parametrize(('latency', 'late'), [(0.12, False), (0.18, True)])
+def test_odometry_late_at_setpoints_of_a_flight_is_named(latency, late):
+    gate = fresh_gate()
+    for now in np.arange(10.0, 30.0, 0.05):
+        gate.take_motion('odom', MotionReport((0.0, 0.0, 0.0)), latency, now)
+        decide(gate, now)
+        if now == 10.0:
+            assert gate.motion.lateness() == ''  # one late message is none
+    assert ('0.18 s old' in gate.motion.lateness()) == late
+
+
 def test_a_velocity_that_comes_late_replaces_no_newer_one():
     gate = fresh_gate()
     assert gate.take_motion('odom', MotionReport((0.9, 0.0, 0.0)), 0.2, 10.0) == ''

@@ -82,6 +82,7 @@ class BridgeProblems:
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
                 (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
+                (WARN, lambda _: bridge.gate.motion.lateness()),
                 (WARN, self._planner_differs), (WARN, self.planner.changed_in_flight),
                 (WARN, self.perception.changed_in_flight), (WARN, self._heights_differ),
                 (WARN, self._battery_unknown)))]
