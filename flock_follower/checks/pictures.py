@@ -34,6 +34,8 @@ MEAN_TOO_DARK = 12.0
 MEAN_TOO_BRIGHT = 243.0
 #: Standard deviation of the gray levels below which an image shows nothing.
 DEVIATION_TOO_FLAT = 3.0
+#: Difference of fx and fy, as a share, above which pixels are not square: 1 % is usual.
+NOT_SQUARE: Final = 0.03
 #: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
 
@@ -85,6 +87,9 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
         (straight and np.any(camera.distortion), ERROR,
          f'{measured}, distorted, but the topic is marked as rectified',
          'start relative_pose and planner with rectified:=true'),
+        (abs(camera.matrix[0, 0] / camera.matrix[1, 1] - 1.0) > NOT_SQUARE, WARNING,
+         f'{measured}, but {camera.matrix[1, 1]:.0f} px vertically: pixels not square',
+         'are the images stretched? If not, calibrate again'),
         (True, OK, measured, ''))
 
 

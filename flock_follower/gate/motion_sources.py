@@ -49,8 +49,8 @@ from flock_follower.gate.velocity_check import (
 )
 from flock_follower.geometry import Array
 
-#: Mean age of odometry at decisions, s, above which it is late. At 0.2 s the height of an ArduCopter
-#: that fused it swung more and more.
+#: Mean age of odometry at decisions, s, above which it is late. At 0.2 s the height of an
+#: ArduCopter that fused it swung more and more.
 LATE_AGE: Final[float] = 0.15
 #: Share of each decision in that mean: 5 s at 20 Hz.
 AGE_SHARE: Final[float] = 0.01

@@ -274,6 +274,10 @@ FAULTS: list[Fault] = [
           moving(1.0 / 1.2)),
     Fault('a focal length 20% too short', BOTH, ERROR, 'focal length', '1.25 ', 'this lens',
           moving(1.0 / 0.8)),
+    Fault('focal lengths that differ', BOTH, WARNING, 'calibration', 'not square',
+          'are the images stretched? If not, calibrate again',
+          change(lambda seen: seen.calibration, k=[
+              FOCAL, 0.0, 320.0, 0.0, 1.08 * FOCAL, 240.0, 0.0, 0.0, 1.0])),
     Fault('a calibration without a matrix', BOTH, ERROR, 'calibration', 'K = 0',
           'calibrate the camera',
           change(lambda seen: seen.calibration, k=[0.0] * 9)),
