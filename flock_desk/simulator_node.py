@@ -25,8 +25,9 @@ With ``vehicle:=external`` the follower is flown by an external autopilot, usual
 ``truth_connection`` reports its place. The leader appears at the place of the scenario as soon as
 ``mavlink_bridge/state`` is ACTIVE. The scenario ends early if that is ACTIVE no more; the node
 ends when, after the scenario, the vehicle is disarmed. With ``leader_truth_connection`` the leader
-is another such vehicle, and is seen where it truly is. With ``leader_topic`` the leader is the
-vehicle of another simulator node, so followers fly in a column; the node ends with that one.
+is the vehicle of a second external autopilot, at its true pose. With ``leader_topic`` the leader
+is the vehicle of another simulator node, so followers fly in a column; this node ends when the
+other node ends.
 """
 
 from __future__ import annotations

@@ -15,11 +15,11 @@
 """
 Simulated flights since ``engage``: their record at every planner tick, and their figures.
 
-All is true, not estimated. Each array has one row per follower, see ``world``. A single follower
-follows the leader. In a flock each follows the edges of its planner; before the first edge, the
-vehicle ahead of its start. ``of_runs`` puts the rows of a flock's followers together run by run:
-the worst of them if safety or a share of runs asks for that, else the mean. One that fails is
-left out: its effect on the others is in their figures.
+All values are true, not estimated. Each array has one row per follower, see ``world``. Distances
+are to the leader; in a flock to the neighbors with an edge, or before the first edge to the
+vehicle ahead. ``of_runs`` combines the rows of a flock's followers run by run: the worst value for
+safety and for shares of runs, else the mean. A follower that fails is left out; its effect on the
+others is in their figures.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ def measure(flights: Flights) -> Measures:
 
 
 def of_runs(rows: Measures, flights: Flights) -> Measures:
-    """Return the measures of the runs of a flock, of those of its followers, and some more."""
+    """Return the measures of the runs of a flock: of its followers combined, and of the flock."""
     kept = _find_counted(flights)
     by_run = len(flights.positions), -1
     tracking = flights.state == STATES.index(State.TRACK)

@@ -122,7 +122,7 @@ class ScenarioRun:
         """
         Return the delay of the next image, s.
 
-        That is the latency of the scenario, which varies by a tenth, without that of the nodes.
+        This is the latency of the scenario, varied by 10 %, minus the latency of the nodes.
         """
         latency = self._latency * (1.0 + self._latency_rng.uniform(-0.1, 0.1))
         return float(max(latency - PROCESSING, 0.0))

@@ -15,8 +15,9 @@
 """
 Surroundings of a scenario's followers: leader, air, vehicles, odometry, stepped by COURSE_STEP.
 
-Nothing here plans or reads a clock; the caller passes in the setpoints. Every
-follower is a row: those of the first run by their numbers, then those of the second, and so on.
+Nothing here plans or reads a clock; the caller passes in the setpoints. Each follower is a row:
+first the followers of the first run in the order of their numbers, then those of the second run,
+and so on.
 """
 
 from __future__ import annotations
@@ -246,8 +247,8 @@ class World:
         """
         Return each vehicle's position, velocity, yaw, and its autopilot's velocity and height, m.
 
-        The height is that of its barometer, which rests on no odometry. To be called once in every
-        control cycle: each call is a new sample of the noise.
+        The height is the barometer's, independent of odometry. Call this once per control cycle:
+        each call draws new noise.
         """
         vehicle = self.vehicle
         return list(zip(vehicle.position, vehicle.velocity, vehicle.yaw.tolist(),

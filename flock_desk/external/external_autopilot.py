@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The links on which external autopilots report the place of the vehicles that they fly.
+The links on which external autopilots report the poses of their vehicles.
 
-In one flight they fly the follower, perhaps its leader. Each has its own link. Both vehicles share
-a frame, ENU from the follower's first reported place, since both truths are latitude, longitude
-and height.
+An external autopilot flies the follower; a second one, with a link of its own, can fly the leader.
+Both vehicles share a frame, ENU from the follower's first reported place, since both truths are
+latitude, longitude and height.
 
 A separate thread receives, since messages of ground truth have no time: their time is that of
 arrival. The link requests the messages that it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands

@@ -121,7 +121,8 @@ class ExternalMotion:
         """
         Return the motion at a time, ns, interpolated, also if ``knows`` is False.
 
-        Before the first pose it is that one, after the last one the last: nothing is extrapolated.
+        Before the first pose the first pose is returned, after the last pose the last: nothing is
+        extrapolated.
 
         :raises ValueError: if no pose has come yet.
         """

@@ -78,7 +78,7 @@ class Chapter(NamedTuple):
 
 
 def table(summary: Mapping[str, Any], judgments: Sequence[Judgment]) -> list[str]:
-    """Return the lines of the figures shown, bounds and verdicts beside those that have one."""
+    """Return the table of the shown figures, with bound and verdict if a figure has a bound."""
     judged = {judgment.bound.key: judgment for judgment in judgments}
     figures = {key: value for key, value in flat(summary)
                if key in judged or (value is not None and shown(key))}

@@ -57,7 +57,7 @@ class Course:
         """
         Return position, velocity, acceleration (3,) and heading at a time, s.
 
-        Beyond the end they are those of the end.
+        Beyond the end the values of the end are returned.
         """
         last = len(self.positions) - 1
         share, whole = math.modf(min(max(time / COURSE_STEP, 0.0), float(last)))

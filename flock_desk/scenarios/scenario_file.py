@@ -27,7 +27,7 @@ name is the scenario's. A missing key keeps its default::
     variants:
       faster: {flight: {v_max: 2}}
 
-A variant is a scenario of its own name, which differs in the keys that it has.
+A variant is a scenario with a name of its own; it contains only the keys that differ.
 """
 
 from __future__ import annotations

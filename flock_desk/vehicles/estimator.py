@@ -15,10 +15,10 @@
 """
 The sensors of the embedded autopilot: its position estimator and its barometer.
 
-With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
-they are right or not, and dead-reckons with a biased accelerometer once they stop: position and
-velocity go on, and drift. The barometer measures the standard atmosphere with white noise and a
-slow drift. ENU; the time is given.
+With GPS the estimate is the truth. With vision the estimate follows the poses of ODOMETRY, right
+or wrong. Without new poses it integrates a biased accelerometer, so position and velocity drift.
+The barometer measures the standard atmosphere with white noise and a slow drift. ENU; the time is
+given.
 """
 
 from __future__ import annotations

@@ -191,7 +191,7 @@ class FlightController(ABC):
                 'at rest': self.on_ground}
 
     def missing(self, mode: str, now: float, arming: tuple[str, ...] = ()) -> list[str]:
-        """Return the conditions that a mode needs, and more, as far as they are not met."""
+        """Return the conditions, those in ``arming`` and those of a mode, that are not met."""
         met = self.conditions(now)
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 

@@ -336,9 +336,9 @@ class Sharing:
         """
         Return the received vehicles that are not seen, in the ego frame, one state per vehicle.
 
-        A state keeps its stamp; its covariances are those of its prediction to ``now``. If several
-        states of one vehicle are known, the state with the least uncertainty is used, not their
-        mean, because their errors may be correlated.
+        A state keeps its stamp; its covariances are predicted to ``now``. If several states of one
+        vehicle are known, the state with the least uncertainty is used, not their mean, because
+        their errors may be correlated.
         """
         self._senders = {name: each for name, each in self.senders.items()
                          if now - each.received <= FORGOTTEN}

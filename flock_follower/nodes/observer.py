@@ -195,7 +195,7 @@ class Observer(Node):
                 self.seen.names[ours] = topic
 
     def _take_values(self, node: str, values: dict[str, Any]) -> None:
-        """Keep the parameters of a node; of several cameras those of the one to observe."""
+        """Keep the parameters of a node; with several cameras, those of the observed camera."""
         if NAMES in values:
             camera, values = alone(values, self._camera)
             topics = topics_of_camera(camera.image, camera.camera_info) if camera.name else {}

@@ -183,7 +183,7 @@ class View(FlockNode):
                 each.callback(received[0])
 
     def _on_wake(self) -> None:
-        """Run the turn at once, after a page was opened or closed, or a button was pressed."""
+        """Run one cycle at once, after a page was opened or closed, or a button was pressed."""
         try:
             self._turn()
         except Exception as error:

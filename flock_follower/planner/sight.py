@@ -50,7 +50,8 @@ class FieldOfView(NamedTuple):
     up: float
     down: float
     heading: float = 0.0
-    """Anticlockwise angle of its axis, if it is one of several, rad; the others count from it."""
+    """Anticlockwise angle of the camera's axis, rad, if there are several cameras; the other
+    angles count from it."""
 
     @classmethod
     def of_camera(cls, info: Any, rpy: ArrayLike, several: bool = False,

@@ -228,7 +228,7 @@ def search_yaw(last: float, me: OwnState, there: Neighbor, since: float, params:
 def turn_rate(before: float, commanded: float, me: OwnState, params: PlannerParams,
               elapsed: float) -> float:
     """
-    Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
+    Return the yaw rate, rad/s, anticlockwise, that follows the commanded yaw.
 
     The rate is that of the commanded yaw, plus a correction towards this yaw, because an autopilot
     that receives a rate does not control the yaw itself.
