@@ -141,7 +141,7 @@ class VehicleAhead:
 
     def leader(self, epoch_ns: int, offset: Sequence[float]) -> ExternalLeader:
         """
-        Return it as the leader of a flight that begins at ``epoch_ns`` of ROS time.
+        Return this vehicle as the leader of a flight that begins at ``epoch_ns`` of ROS time.
 
         :param offset: (3,), m, where the odom frame of that vehicle begins in ours.
         """

@@ -226,8 +226,9 @@ def spline(motion: LeaderMotion, speed: float, times: Array, rng: np.random.Gene
     """
     Return the velocities (n, 3) along a uniform cubic B-spline through random points.
 
-    The points are as far apart as it flies in 1 to 1.6 s, each direction within 1.2 rad of the
-    last one; the time between two is as short as the bounds allow.
+    The distance between two points is 1 to 1.6 s times ``speed``; the direction changes by at most
+    1.2 rad from leg to leg. All legs take the same time, at least 1 s, else as short as the bounds
+    of speed and acceleration allow.
     """
     count = math.ceil(times[-1]) + 8
     headings = np.cumsum(rng.uniform(-1.2, 1.2, count))

@@ -85,7 +85,8 @@ class Altitude(NamedTuple):
         return cls(z, min(low, z), max(high, z), ground=ground, limits=limits)
 
     def after_jump(self, z: float, jump: float) -> Altitude:
-        """Return it in a frame of odometry that is higher by ``jump``, m; it holds ``z``, m."""
+        """Return this altitude in a frame of odometry that is higher by ``jump``, m; hold ``z``,
+        m."""
         return Altitude(z, min(self.lowest + jump, z), max(self.highest + jump, z),
                         ground=None if self.ground is None else self.ground + jump,
                         limits=self.limits)
