@@ -79,7 +79,7 @@ class Sender:
         place, yaw = self.frame.stds
         return not (place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX)  # NaN is vague
 
-    def unusable(self, now: int) -> str:
+    def unusable_reason(self, now: int) -> str:
         """Return why the sender's messages are not used at a time, ns, or ''."""
         if now < self.ban[0]:
             return self.ban[1]

@@ -85,8 +85,7 @@ class Altitude(NamedTuple):
         return cls(z, min(low, z), max(high, z), ground=ground, limits=limits)
 
     def after_jump(self, z: float, jump: float) -> Altitude:
-        """Return this altitude in a frame of odometry that is higher by ``jump``, m; hold ``z``,
-        m."""
+        """Return this altitude, now ``z``, m, in an odometry frame higher by ``jump``, m."""
         return Altitude(z, min(self.lowest + jump, z), max(self.highest + jump, z),
                         ground=None if self.ground is None else self.ground + jump,
                         limits=self.limits)
