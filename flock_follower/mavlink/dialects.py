@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The supported autopilots as records: modes, take-off, frames, messages, rules."""
+"""
+The supported autopilots as records: modes, take-off, frames, messages, rules.
+
+Another autopilot is another record, its texts in ``status_texts``, and a file in config/.
+"""
 
 from __future__ import annotations
 
