@@ -252,7 +252,8 @@ def column_figures(scenario: Scenario, flights: Mapping[str, LiveFlight]) -> dic
     """
     Return the figures of a whole column, for the time in which all its vehicles flew.
 
-    ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
+    ``nearest_m`` is the least true distance of any two vehicles; ``pairs`` has the least distance
+    of each pair.
     """
     logs = {name: flight.log for name, flight in flights.items()}
     times = np.arange(max(float(log['began']) for log in logs.values()),

@@ -76,7 +76,7 @@ _ENTRY = """\
 
 
 class Placed(NamedTuple):
-    """A marker on a print: its side, m, that with the white border and its middle's place, mm."""
+    """A marker on a print: its side, m; its side with the white border, mm; its center, mm."""
 
     marker_id: int
     side_length: float

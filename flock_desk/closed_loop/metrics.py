@@ -84,13 +84,14 @@ class Flights:
     seen: Any
     """(n, k), whether an image since the last tick showed a followed vehicle."""
     in_sight: Any
-    """(n, k), the same of the newest image, outages and missed detections left out."""
+    """(n, k), whether the newest image could show one; outages and missed detections do not
+    count."""
     obeying: Any
     """(n, k), whether the vehicle flies setpoints."""
     unasked: Array
     """(n, k), setpoints sent without an offboard call."""
     shown: Any = None
-    """(n, k), how many of the others images since the last tick showed."""
+    """(n, k), number of other vehicles in the images since the last tick."""
     edges: Any = None
     """(n, k), how many it follows."""
     positions: Any = None
@@ -191,7 +192,7 @@ Reduction = Callable[..., Any]
 
 
 class Figure(NamedTuple):
-    """A figure of a scenario: of which measure, and over runs and over the followers of one."""
+    """A figure of a scenario: its measure, and how it is combined over runs and over followers."""
 
     measure: str
     over_runs: Reduction
@@ -336,13 +337,13 @@ def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float,
 
 
 def _stretches(values: Any) -> Any:
-    """Return the first and the last + 1 index (m, 2) of each stretch of True."""
+    """Return the first index and the last index + 1, (m, 2), of each stretch of True."""
     edges = np.diff(np.concatenate([[False], values, [False]]).astype(int))
     return np.flatnonzero(edges).reshape(-1, 2)
 
 
 def _longest_run(missing: Array, at_the_end: bool = False) -> int:
-    """Return the greatest number of consecutive True values, or of those at the end."""
+    """Return the greatest number of consecutive True values, anywhere or at the end."""
     lengths = np.diff(_stretches(missing)).ravel()
     if at_the_end:
         return int(lengths[-1]) if missing[-1] else 0

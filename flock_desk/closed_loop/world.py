@@ -205,7 +205,7 @@ class World:
             self._sense(now)
 
     def placed(self, now: float) -> float:
-        """Return the time, s, at which odometry of now has arrived."""
+        """Return the time, s, at which the odometry of now arrives."""
         here = bool(self._odometry) and self._odometry[0][0].stamp == now
         return now if here else self._due.next
 
@@ -260,7 +260,7 @@ class World:
         self._coming.append((self.step, setpoints))
 
     def _take_setpoints(self, k: int) -> None:
-        """Let setpoints arrive that were sent as long ago as the vehicle of their row lags."""
+        """Let setpoints arrive that were sent one delay of their vehicle ago."""
         accelerations, yaws = self._flown
         arrived = False
         for sent, setpoints in self._coming:

@@ -56,13 +56,13 @@ LANDED: Final[str] = 'EXTENDED_SYS_STATE'
 ASK_PERIOD: Final[float] = 2.0
 """s between requests of the messages."""
 TRUTH_TIMEOUT: Final[float] = 6.0
-"""s of received messages without a truth, after which the estimate is used."""
+"""s without ground truth after the first message; then the estimate is used."""
 POSE_TIMEOUT: Final[float] = 30.0
 """s for the first pose of a vehicle."""
 REPORTED_SILENCE: Final[float] = 0.5
 """s without a pose, after which it is reported."""
 LOST: Final[float] = 10.0
-"""s without a pose of the follower after which there is nothing to simulate."""
+"""s without a pose of the follower; then the simulation ends."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 # The truth of each; an autopilot may complain of messages that it does not know.
@@ -218,7 +218,7 @@ class ExternalVehicles:
         """
         Wait until the positions of the vehicles are known.
 
-        :param forwarded: whether the follower is sent odometry made of where it is.
+        :param forwarded: whether the follower receives odometry that is made from its own pose.
         :param wanted: returns whether to go on waiting.
         :raises ValueError: if a vehicle sends no pose, or no truth although it has to.
         """
@@ -260,7 +260,7 @@ class ExternalVehicles:
             f'{self.follower.silence()}')
 
     def stalled(self, now: float, time_ns: int) -> str:
-        """Return, for people, which poses are missing at a time of the flight; '' for none."""
+        """Return a text that names the poses missing at a time of the flight; '' for none."""
         problems = []
         for name, link in self._links:
             # Whether the leader's poses reach up to now is known a little later.

@@ -87,7 +87,7 @@ class ExternalMotion:
         return self.source == ESTIMATE
 
     def take(self, message: Any, now: int) -> None:
-        """Take a message of the autopilot received at ``now``, ns; most are of no concern."""
+        """Take a message of the autopilot received at ``now``, ns; most messages are ignored."""
         kind = message.get_type()
         if kind in TRUTHS and self.source in ('', kind):
             self._truth(message, now)

@@ -43,8 +43,9 @@ def along_law(commands: Iterable[Any], neighbors: Sequence[OdometryState],
     """
     Return whether each command points along the law, horizontally.
 
-    The guard and the limits change the law's length and direction, but seldom turn it round.
-    Commands that rest on no estimate, or on one without odometry at its stamp, are left out.
+    The guard and the limits change length and direction of the law's command, but seldom reverse
+    it. Commands without an estimate, or with an estimate that has no odometry at its stamp, are
+    left out.
 
     :param neighbors: as published. :param own: the odometry.
     """

@@ -180,12 +180,12 @@ FIGURES: Final[dict[str, Figure]] = {
 
 
 def parts_of(key: str) -> list[str]:
-    """Return the groups of a key, and its figure; a dot between digits is that of a number."""
+    """Return the groups of a key, and its figure; a dot between digits belongs to a number."""
     return re.split(r'\.(?!\d)|(?<!\d)\.', key)
 
 
 def words(key: str) -> str:
-    """Return name and unit of a figure or group; of one that is not in the table, its key."""
+    """Return name and unit of a figure or group; the key if it is not in the table."""
     last = parts_of(key)[-1]
     for known in (key, last):
         if known in FIGURES:

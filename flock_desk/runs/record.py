@@ -191,7 +191,8 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
     """
     Return the flight of a scenario that `fly` recorded in a folder.
 
-    :param namespace: of its nodes; others publish their diagnostics on the same topic.
+    :param namespace: of the flight's nodes; other nodes publish their diagnostics on the same
+    topic.
     :raises BagError: if its record cannot be read.
     :raises LateError: if the scenario never began, no image was made, or nothing was written.
     """

@@ -199,7 +199,7 @@ def _chapter(chapter: Chapter) -> str:
 
 
 def _group(group: str, figures: Mapping[str, Any]) -> str:
-    """Return the table of a group of figures; of '', those in no group."""
+    """Return the table of a group of figures; '': the figures in no group."""
     rows = []
     for key, value in flat(figures, f'{group}.' if group else ''):
         shown_value = '<br>'.join(filter(None, [escape(text(value)), _verdict(key, value)]))

@@ -219,7 +219,7 @@ def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None],
     Return the summary of ``demo``.
 
     Beside :func:`flight_figures`: ``processed_share`` is the share of the bag's images that
-    perception processed in time; ``recall_of_processed`` is that of these.
+    perception processed in time; ``recall_of_processed`` is the recall of these images.
     """
     common = flight_figures(flight, exit_codes, load)
     processed = flight.value('relative_pose', 'images_processed', math.inf) / common['frames']
@@ -308,7 +308,7 @@ def outage_name(outage: Outage) -> str:
 
 
 def judged_outages(flight: LiveFlight) -> list[Outage]:
-    """Return the outages long enough, and flown far enough, to demand HOLD."""
+    """Return the outages that are long enough, and were flown long enough, to require HOLD."""
     return [outage for outage in flight.scenario.outages if outage.duration >= hold_within(outage)
             and flight.duration >= outage.at + hold_within(outage)]
 
@@ -333,7 +333,7 @@ def _problems(flight: LiveFlight) -> dict[str, int]:
 
 
 def _longest_time(times: Array, holds: Any) -> float:
-    """Return the longest time, s, at whose images (n,) something holds, from the one before."""
+    """Return the longest time, s, for which images (n,) hold, from the image before them."""
     longest, since = 0.0, math.inf
     for time, held in zip(times.tolist(), holds.tolist()):
         since = min(since, time) if held else time

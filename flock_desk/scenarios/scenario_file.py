@@ -128,7 +128,7 @@ def parse(text: str, path: str, variant: str = '') -> Scenario:
 
 
 def _part(kind: Any, given: Any, where: str, before: Any = None, **more: Any) -> Any:
-    """Return one of a kind of dataclass; a missing key is as in ``before``, or the default."""
+    """Return a part of a kind, a dataclass; missing keys are as in ``before``, or the default."""
     hints, prefix = get_type_hints(kind), f'{where}.'.lstrip('.')
     allowed = [f.name for f in fields(kind) if f.name != 'name']
     if not isinstance(given, dict):

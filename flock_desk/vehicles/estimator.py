@@ -56,7 +56,7 @@ class Estimator:
     The estimate: the truth plus an error that vision keeps small.
 
     :param uses_vision: False for GPS.
-    :param now: time, s. A vehicle in the air begins as if vision had come until then.
+    :param now: time, s. If the vehicle starts in the air, vision counts as received until then.
     :param ready_at: the time, s, before which there is no estimate.
     """
 

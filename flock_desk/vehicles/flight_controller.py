@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One flight controller, as a companion computer meets it: modes, arming, and how its modes fly.
+One flight controller, as a companion computer uses it: modes, arming, and the flight in each mode.
 
 The measured reactions are in docs/autopilots.md. ``px4`` and ``arducopter`` add their rules for
 setpoints, take-off, landing and failsafes. ENU; the time is given.

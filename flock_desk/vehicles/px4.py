@@ -101,7 +101,7 @@ class Px4(FlightController):
         return ACCEPTED
 
     def pilot_switches(self, name: str) -> None:
-        """Change the mode by remote control; from then on there is one."""
+        """Change the mode by remote control; from then on there is a transmitter."""
         super().pilot_switches(name)
         self._sticks = True
         self._remember(name)
