@@ -124,7 +124,7 @@ class ExternalAutopilot:
             if received > TRUTH_TIMEOUT and not self.motion.source:
                 if why_truth:
                     raise ValueError(f'{self.parameter} = {self.url!r}: {self.silence()}; its own '
-                                     f'estimate will not do where {why_truth}')
+                                     f'estimate is not sufficient: {why_truth}')
                 self.motion.source = ESTIMATE
             if now > deadline:
                 raise ValueError(f'{self.parameter} = {self.url!r}: no pose of a vehicle within '

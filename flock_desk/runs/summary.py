@@ -333,7 +333,7 @@ def _problems(flight: LiveFlight) -> dict[str, int]:
 
 
 def _longest_time(times: Array, holds: Any) -> float:
-    """Return the longest time, s, for which images (n,) hold, from the image before them."""
+    """Return the longest time, s, in which ``holds`` (n,) is True, from the image before it."""
     longest, since = 0.0, math.inf
     for time, held in zip(times.tolist(), holds.tolist()):
         since = min(since, time) if held else time

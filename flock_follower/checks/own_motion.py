@@ -87,7 +87,7 @@ EVENTS: Final = (
     ('odom changed its frames', 'odom frames', ERROR,
      'is it published by two sources? Every change starts perception anew'),
     ('odom out of order', 'odom order', WARNING,
-     'of two sources in one topic take one; messages older than the one before are not used'),
+     'if two sources publish on this topic, keep one; a message with an older stamp is not used'),
     ('odom gap', 'odom gaps', WARNING,
      'see in the log of its source why it pauses: without odometry the follower brakes'))
 #: Error of the mounting, rad, from which on there is a warning.
