@@ -267,7 +267,7 @@ def _machine(load: Load | None) -> Machine:
 
 
 def _find_reach() -> list[tuple[str, Reach | None]]:
-    """Return from where our nodes on this computer are reached; if it sees none, ``check``."""
+    """Return which computers reach our nodes here, or ``check`` if none of our nodes is seen."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     ours = [(node, process) for process, node, environment in find_processes()
             if environment.get('ROS_DOMAIN_ID', '0') == domain]

@@ -237,7 +237,7 @@ class View(FlockNode):
         self._timer.reset()
 
     def _names(self) -> dict[str, str]:
-        """Return the names of our topics as relative_pose has them, ours without it."""
+        """Return the names of the topics of relative_pose; our default names without this node."""
         names = {'odom': 'odom', 'camera_info': self._camera.camera_info,
                  RAW_IMAGES: self._camera.images(self._transport),
                  'compressed': 'yes' if self._transport == 'compressed' else ''}

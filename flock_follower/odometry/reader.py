@@ -263,7 +263,8 @@ class OdometrySource:
         return True
 
     def _derived_rates(self) -> Array:
-        """Return the angular velocity (3,), rad/s, by the attitudes: those not yet taken in."""
+        """Return the angular velocity (3,), rad/s, from the attitudes, including the newest
+        ones."""
         for time, quaternion in self._attitudes:
             self.turning.take(time, quaternion)
         self._attitudes.clear()
