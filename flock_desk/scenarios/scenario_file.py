@@ -93,7 +93,7 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also if it has operations or a flock: only in lock step.
+    :raises ScenarioError: also for operations or a flock, which fly in lock step only.
     """
     scenario = load(name)
     for part in ('operations', 'flock'):

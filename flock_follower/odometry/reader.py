@@ -263,8 +263,7 @@ class OdometrySource:
         return True
 
     def _derived_rates(self) -> Array:
-        """Return the angular velocity (3,), rad/s, from the attitudes, including the newest
-        ones."""
+        """Return the angular velocity (3,), rad/s, from all attitudes so far."""
         for time, quaternion in self._attitudes:
             self.turning.take(time, quaternion)
         self._attitudes.clear()

@@ -38,7 +38,7 @@ OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
 #: Parameters of earlier versions, and the reason or the replacement.
 REMOVED = {
     'altitude_hold': 'it is now altitude_mode: hold for true, or follow',
-    'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
+    'setpoint_mode': 'setpoints have acceleration and yaw, which both autopilots obey',
     'j_max': 'the jerk of setpoints is not limited: remove the line',
     'check_parameters': 'they are always compared: remove the line',
     'range_max': 'the bridge bounds the distance: set radius_max of mavlink_bridge',
