@@ -17,8 +17,8 @@ The demonstration: replays a bag to MAVLink setpoints, and compares the result w
 
 ``python -m flock_desk.demo`` starts replay, relative_pose, planner, mavlink_bridge and
 the embedded autopilot, each a process of its own, in a ROS domain and on a UDP port that
-other machines cannot receive. Exit code 0 only if every bound holds; 3 if the machine was too
-busy to judge those on time, and the others hold.
+other machines cannot receive. Exit code 0 only if every bound holds; 3 if the machine was too busy
+to judge the bounds on times, and the other bounds hold.
 """
 
 from __future__ import annotations

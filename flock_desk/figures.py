@@ -15,11 +15,11 @@
 """
 The figures of the paper, redrawn: ``python -m flock_desk.figures``.
 
-Without ``--agents`` the figures of Liu & Qiu (AAMAS 2020) on simulations, and a table of their
-figures, for the law and the models it is compared with; and the controllers that ``flights``
-compared, runs in the band against jerk. With ``--agents N`` one larger flock of the law on a
-neighbor graph. Each is as wide as a column, without a title, as PNG, SVG and PDF. Two runs write
-the same bytes. Flights are drawn by the reports of ``fly``.
+Without ``--agents``: the simulations of Liu & Qiu (AAMAS 2020) with the law and the models that
+they compare, as pictures and a table; and, for the controllers of ``flights``, the share of runs
+in the band against jerk. With ``--agents N`` one larger flock of the law on a neighbor graph. Each
+is as wide as a column, without a title, as PNG, SVG and PDF. Two runs write the same bytes.
+Flights are drawn by the reports of ``fly``.
 """
 
 from __future__ import annotations

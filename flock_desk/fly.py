@@ -18,8 +18,8 @@ A closed-loop flight on the desk: the simulator in place of camera, odometry and
 ``python -m flock_desk.fly --scenario indoor`` starts simulator, relative_pose, planner
 and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that
 other machines cannot receive; arms, changes to offboard mode, engages, and flies the scenario.
-Exit code 0 only if every bound holds; 3 if the machine was too busy to judge those on time, and
-the others hold.
+Exit code 0 only if every bound holds; 3 if the machine was too busy to judge the bounds on times,
+and the other bounds hold.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
 flown by an autopilot that runs already, see docs/desk.md: from the ground, and back to it. With
@@ -252,7 +252,8 @@ def column_figures(scenario: Scenario, flights: Mapping[str, LiveFlight]) -> dic
     """
     Return the figures of a whole column, for the time in which all its vehicles flew.
 
-    ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
+    ``nearest_m`` is the least true distance of any two vehicles; ``pairs`` has the least distance
+    of each pair.
     """
     logs = {name: flight.log for name, flight in flights.items()}
     times = np.arange(max(float(log['began']) for log in logs.values()),

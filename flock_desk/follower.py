@@ -17,15 +17,15 @@ One follower as one object: events in, each with its time; estimates, commands a
 
 Perception, planner and setpoint control are the same three objects that the nodes drive, each in
 a process of its own. Here they share the clock of the caller: the bag's time in ``evaluate``, the
-simulated time in ``flights``, which runs no perception. Computing and passing messages on take no
-time: an estimate reaches the planner when its image comes, or the odometry that the image waits
-for; a command reaches the control at the tick.
+simulated time in ``flights``, which runs no perception. Computation and messages take no time: an
+estimate reaches the planner when its image arrives, or, if the image waits for odometry, when this
+odometry arrives; a command reaches the control at the tick.
 
-The planner ticks every ``period``, and when images cease; the control sends every
-1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
-reach the planner just before its tick, and own messages are sent then. Events of the
-same nanosecond happen in this order: an image that waited for odometry too long, the planner's
-tick, the control's cycle, the event.
+The planner ticks every ``period``, and when images stop; the control sends every 1 /
+``stream_rate``. Both start one interval after the first event. Messages of other followers reach
+the planner just before its tick, and own messages are sent then. Events of the same nanosecond
+happen in this order: an image that waited for odometry too long, the planner's tick, the control's
+cycle, the event.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ class Follower:
         """
         Take the autopilot's attitude, (x, y, z, w), FLU to ENU, and its rates (3,), rad/s, FLU.
 
-        :returns: the motion without odometry, while that is flown on.
+        :returns: the motion without odometry, while the vehicle flies on this motion.
         """
         self.advance(time)
         motion = self._control.take_attitude(
@@ -225,7 +225,7 @@ class Follower:
         return motion
 
     def height(self, time: int, altitude: float, height: float) -> None:
-        """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
+        """Take an altitude of the autopilot's barometer, m; the first one is at ``height``, m."""
         self.advance(time)
         self._control.take_height(altitude, self._seconds())
         if not self._control.heights.has_reference:
@@ -349,7 +349,7 @@ class Follower:
     # Due work.
 
     def _seconds(self, time: int | None = None) -> float:
-        """Return seconds from the first event to a time, or now: near zero, floats are exact."""
+        """Return seconds from the first event to a time, or to now: small floats are exact."""
         return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
 
     def _wait_end(self) -> int | None:

@@ -16,10 +16,10 @@
 ``ros2 run flock_follower marker --id 0 --dictionary DICT_4X4_50 --size 0.16 --output marker.pdf``.
 
 Draws markers to scale, one to a page, each with the white border that detection needs and a ruler,
-and prints the neighbors file. With ``--panel`` all are on one page, for one leader that is seen
-from near and from far: the largest on top, the smaller ones below it. The panel's origin is the
-middle of the smallest: nearby, the camera sees little else, so it belongs at the height of the
-camera. Two runs write the same bytes. ``--output NAME.png --pixels N`` writes one marker as a
+and prints the neighbors file. With ``--panel`` all markers are on one page, the largest on top,
+for a leader that is followed at small and large distances. The panel's origin is the middle of the
+smallest marker. Mount this marker at the height of the camera: at a small distance the camera sees
+little else. Two runs write the same bytes. ``--output NAME.png --pixels N`` writes one marker as a
 texture for simulators.
 """
 
@@ -76,7 +76,7 @@ _ENTRY = """\
 
 
 class Placed(NamedTuple):
-    """A marker on a print: its side, m, that with the white border and its middle's place, mm."""
+    """A marker on a print: its side, m; its side with the white border, mm; its center, mm."""
 
     marker_id: int
     side_length: float
@@ -233,7 +233,7 @@ def draw(dictionary: str, markers: Sequence[Placed]) -> Page:
 
 
 def cells_of(dictionary: str, marker_id: int, left: float, top: float, side: float) -> list[Box]:
-    """Return a marker's black cells, those beside each other in a row as one box."""
+    """Return a marker's black cells; adjacent cells of a row are one box."""
     cells = marker_cells(dictionary)
     black = np.pad(draw_marker(dictionary, marker_id, cells) < 128, ((0, 0), (1, 1)))
     edges = np.arange(cells + 1) * side / cells

@@ -196,7 +196,7 @@ class Recording:
         return messages
 
     def messages(self, images: Iterable[BagMessage]) -> Iterator[BagMessage]:
-        """Yield every message in the order of arrival, given the images in theirs."""
+        """Yield every message, and the given images, in the order of arrival."""
         odom = deque(self.odom())
         for k, image in enumerate(images):
             info = self.camera_info(k)

@@ -23,10 +23,11 @@ scenario begins, and the node ends with it.
 
 With ``vehicle:=external`` the follower is flown by an external autopilot, usually a simulator, and
 ``truth_connection`` reports its place. The leader appears at the place of the scenario as soon as
-``mavlink_bridge/state`` is ACTIVE. The scenario ends early if that is ACTIVE no more; the node
-ends when, after the scenario, the vehicle is disarmed. With ``leader_truth_connection`` the leader
-is another such vehicle, and is seen where it truly is. With ``leader_topic`` the leader is the
-vehicle of another simulator node, so followers fly in a column; the node ends with that one.
+``mavlink_bridge/state`` is ACTIVE. The scenario ends early if the bridge is no longer ACTIVE; the
+node ends when the vehicle is disarmed after the scenario. With ``leader_truth_connection`` the
+leader is the vehicle of a second external autopilot, at its true pose. With ``leader_topic`` the
+leader is the vehicle of another simulator node, so followers fly in a column; this node ends when
+the other node ends.
 """
 
 from __future__ import annotations
@@ -255,7 +256,7 @@ class Simulator(FlockNode):
                 self._watch(now)
 
     def _blame(self, what: str) -> None:
-        """Raise TooBusyError if the machine was too busy, and the node ends then."""
+        """Raise TooBusyError, which ends the node, if the machine was too busy."""
         load = None if self._load is None else self._load.worst()
         if load is not None and load.busy:
             raise TooBusyError(f'{what}: {load}; close other programs')

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The topics of the simulator node: images, odometry, and where the vehicles truly are.
+The topics of the simulator node: images, odometry, and the true poses of the vehicles.
 
 Stamps are in ns. The vehicle of another simulator node can be the leader of this one.
 """
@@ -56,7 +56,7 @@ _VEHICLES = {ODOMETRY: BODY_FRAME, OWN_TRUTH: BODY_FRAME, LEADER_TRUTH: LEADER, 
 
 class SimulatorOutputs:
     """
-    Publishes; images are kept until they have been under way for long enough.
+    Publishes the outputs; each image is kept until its latency is over.
 
     :param info: the camera's calibration.
     :param rate: of images sent.
@@ -135,13 +135,13 @@ class VehicleAhead:
         node.subscribe(Odometry, topic, self._take, QoSProfile(depth=10))
 
     def left(self, now_ns: int) -> int | None:
-        """Return the time of its last motion, ns, if it is silent since then; else None."""
+        """Return the time of the last motion, ns, if the vehicle is silent since, or None."""
         newest = self._motion.newest
         return newest if newest is not None and now_ns - newest > SILENT_NS else None
 
     def leader(self, epoch_ns: int, offset: Sequence[float]) -> ExternalLeader:
         """
-        Return it as the leader of a flight that begins at ``epoch_ns`` of ROS time.
+        Return this vehicle as the leader of a flight that begins at ``epoch_ns`` of ROS time.
 
         :param offset: (3,), m, where the odom frame of that vehicle begins in ours.
         """

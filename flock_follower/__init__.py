@@ -16,7 +16,8 @@
 Bird-flocking control of a follower drone that sees its leader with one camera.
 
 This package contains all code that flies; ``flock_desk`` holds the simulators.
-``test/test_rooms.py`` lists what each folder may import.
+``docs/architecture.md`` follows an image, and a lost leader, through the functions, and names the
+file for each kind of change. ``test/test_rooms.py`` lists what each folder may import.
 """
 
 from flock_follower import signals  # noqa: F401  # first: Ctrl-C during the other imports

@@ -154,6 +154,6 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
 
 
 def _direction(vector: Array) -> Array | None:
-    """Return a vector (3,) of a length of about 1 at a length of 1, None for any other."""
+    """Return a vector (3,) of about unit length, normalized; None for any other vector."""
     length = math.hypot(*vector.tolist())
     return vector / length if 0.5 < length < 2.0 else None  # NaN fails

@@ -13,7 +13,11 @@
 # limitations under the License.
 
 """
-Conversion of messages to numpy and back; the only module that reads and writes their fields.
+Conversion of messages to numpy and back, and the first check of their values.
+
+NaN is refused by ``from_odometry`` here (neighbors), ``odometry.reader`` (odometry),
+``planner.inputs`` (every state), ``gate.setpoint_rules`` (everything that decides on a setpoint)
+and ``mavlink.setpoint_encoding`` (the wire).
 
 The functions work with any message classes: rclpy's in the nodes, the type store's when bags are
 read. To build a message, the caller passes ``make``, which returns an empty message of a type such

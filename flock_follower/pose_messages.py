@@ -70,7 +70,7 @@ def pose_with_covariance(make: Make, stamp: int, frame: str, pose: Transform,
 
 def transforms(make: Make, states: Iterable[Any], namespace: str = '') -> Any:
     """
-    Return the TFMessage of Odometry messages: each pose as that of its child frame.
+    Return the TFMessage of Odometry messages: each pose is the transform to its child frame.
 
     :param namespace: prefix of the name of each child frame.
     """

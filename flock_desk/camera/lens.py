@@ -66,7 +66,8 @@ class Camera:
         """
         Return the directions (x, y), z = 1, in the optical frame, that pixels (u, v) see.
 
-        Pixels beyond a wide lens's image circle see its rim; vignetting darkens them.
+        Pixels outside the image circle of a wide lens get the ray of its rim; vignetting darkens
+        them.
         """
         xd, yd = (u - self.center_x) / self.focal_x, (v - self.center_y) / self.focal_y
         if self.model == 'equidistant':

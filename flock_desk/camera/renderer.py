@@ -15,10 +15,10 @@
 """
 A rendered camera: a leader before its surroundings, through a distorting lens, onto a sensor.
 
-The surroundings are a stored panorama, out of focus and as the middle of the exposure shows it:
-everything but the leader is taken to be far away. The leader's image is the mean over poses that
-are spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
-center of the top-left pixel.
+The surroundings are a stored panorama, out of focus, in the attitude of the middle of the
+exposure: everything except the leader is assumed to be far away. The leader's image is the mean
+over poses that are spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the center
+of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Renderer:
     :param body: the leader's faces.
     :param seed: of the noise.
     :param fineness: its square is the number of samples of the leader per pixel and sub-pose.
-    :param prints: bodies that stand still: faces in the frame of the body, and its pose.
+    :param prints: bodies at rest: the faces in the frame of each body, and its pose.
     """
 
     def __init__(self, camera: Camera, sensor: Sensor, body: Sequence[Face] | None = None,
@@ -141,7 +141,7 @@ class Renderer:
 
 
 def _noise_table(sensor: Sensor) -> NDArray[np.uint8]:
-    """Return the pixel values (levels * draws,): of every level of light with every noise."""
+    """Return the pixel values (levels * draws,) of each level of light with each noise."""
     count, levels = 2 ** _DRAW_BITS, 2 ** _LEVEL_BITS
     draws = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
     draws /= np.sqrt(np.mean(draws * draws))

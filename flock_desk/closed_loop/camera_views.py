@@ -15,8 +15,8 @@
 """
 The perception of simulated followers, image by image: visibility and noise, and the real filters.
 
-Every follower is a row, of n runs with m followers each: run by run, in the order of their
-numbers. Each looks for m others: the leader first, then the other followers by their numbers.
+Each follower is a row: the m followers of the first run by their numbers, then those of the next
+run. Each follower looks for m others: the leader first, then the other followers by their numbers.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ class CameraViews:
     def look_alone(self, k: int, motions: Sequence[OdometryState | None],
                    attitudes: Array) -> None:
         """
-        Take the images of step k in rows without odometry; of each it sees the leader only.
+        Take the images of step k in rows without odometry; only the leader is looked for.
 
         :param motions: the motion by attitude of each row, None with odometry.
         :param attitudes: by the autopilot (rows, 3, 3), FLU to ENU.
@@ -219,7 +219,8 @@ class CameraViews:
         """
         Add a print to the images just taken that show it.
 
-        Which of two is the leader is not modeled: perception is taken to know, as its tests show.
+        The choice between leader and print is not modeled: perception is assumed to be right, as
+        its tests show.
         """
         world, vio = self._world, self._world.vio
         offsets = np.array(place.position) - world.vehicle.position

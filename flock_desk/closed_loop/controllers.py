@@ -18,9 +18,9 @@ The controllers that ``flights`` compares, in place of the law, with or without 
 Each flies the same planner, limits, altitude and yaw. Without the guard they have no bounds:
 
 - the two predecessors of the law, see ``flocking``;
-- a PD servo, the controller that one would write without this package: it keeps the middle of the
-  band, u = P (r - r_m) n + D (v_L - v_F), with P = 2 1/s^2 and D = 3 1/s. Of the gains tried (1 to
-  4 1/s^2, 2 to 4 1/s) the quieter ones lose a leader that reverses.
+- a PD servo, a simple alternative to this package: it keeps the middle of the band, u = P (r -
+  r_m) n + D (v_L - v_F), with P = 2 1/s^2 and D = 3 1/s. Gains of 1 to 4 1/s^2 and 2 to 4 1/s were
+  tried; with the gains of less jerk a leader that reverses is lost.
 """
 
 from __future__ import annotations

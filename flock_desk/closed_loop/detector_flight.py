@@ -16,8 +16,8 @@
 A lock-step flight with the poses of another detector, without clock, messages and images.
 
 The detector is simulated: true poses of the leader in the camera's frame, with noise, latency,
-missing poses and outliers. They take the way of the nodes: ``pose_sources``, filter, planner and
-gate, as ``follower.Follower``. The embedded PX4 flies the setpoints.
+missing poses and outliers. The poses take the same path as in the nodes: ``pose_sources``, filter,
+planner and gate, in one ``follower.Follower``. The embedded PX4 flies the setpoints.
 """
 
 from __future__ import annotations

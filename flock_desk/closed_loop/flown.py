@@ -49,7 +49,7 @@ class _Reported:
     A vehicle whose motion is reported step by step.
 
     :param start_ns: time zero of the flight on the clock of ``motion``.
-    :param origin: (3,), m, of the frame of ``motion`` in that of the flight.
+    :param origin: (3,), m: origin of the frame of ``motion`` in the frame of the flight.
     """
 
     def __init__(self, motion: ExternalMotion, start_ns: int, origin: Array) -> None:
@@ -100,7 +100,7 @@ class EmbeddedVehicle(_Reported):
 
 class ExternalVehicle(_Reported):
     """
-    The vehicle of an external autopilot, in the ENU frame of that.
+    The vehicle of an external autopilot, in the ENU frame of this autopilot.
 
     :param height: m above the ground, of its first reported place.
     """
@@ -136,7 +136,7 @@ class ExternalLeader(_Reported):
         """Do nothing: the leader flies by itself."""
 
     def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return the reported motion; of a future moment, the newest; None once poses stall."""
+        """Return the reported motion, the newest for a future time; None if poses have stopped."""
         newest, at = self._motion.newest, self._start_ns + time_ns
         if newest is None or at - newest > POSE_GAP:
             return None

@@ -15,13 +15,14 @@
 """
 One simulated follower: the real ``follower.Follower``, its odom frame, operator and pilot.
 
-A lone follower's odom frame is the world's. In a flock each has one of its own, which begins
-where it stands and along where it faces, as visual-inertial odometry does.
+The odom frame of a single follower is the world frame. In a flock each follower has its own odom
+frame with the origin and heading of its start, as with visual-inertial odometry.
 
 The operator arms, takes off, calls offboard and engage; the pilot takes over and gives back by
-the mode switch; the bridge may die and start again. An autopilot of few modes obeys them, like
-PX4: it flies take-off, hold and the pilot's climb by itself, and setpoints in its offboard mode,
-with the waits and timeouts measured. MAVLink itself is the embedded autopilots' (``vehicles``).
+the mode switch; the bridge may die and start again. A simple autopilot with the modes of PX4 obeys
+them: it flies take-off, hold and the pilot's climb by itself, and setpoints in its offboard mode,
+with the measured delays and timeouts. MAVLink is simulated by the embedded autopilots only
+(``vehicles``).
 """
 
 from __future__ import annotations

@@ -15,11 +15,11 @@
 """
 Simulated flights since ``engage``: their record at every planner tick, and their figures.
 
-All is true, not estimated. Each array has one row per follower, see ``world``. A single follower
-follows the leader. In a flock each follows the edges of its planner; before the first edge, the
-vehicle ahead of its start. ``of_runs`` puts the rows of a flock's followers together run by run:
-the worst of them if safety or a share of runs asks for that, else the mean. One that fails is
-left out: its effect on the others is in their figures.
+All values are true, not estimated. Each array has one row per follower, see ``world``. Distances
+are to the leader; in a flock to the neighbors with an edge, or before the first edge to the
+vehicle ahead. ``of_runs`` combines the rows of a flock's followers run by run: the worst value for
+safety and for shares of runs, else the mean. A follower that fails is left out; its effect on the
+others is in their figures.
 """
 
 from __future__ import annotations
@@ -84,13 +84,14 @@ class Flights:
     seen: Any
     """(n, k), whether an image since the last tick showed a followed vehicle."""
     in_sight: Any
-    """(n, k), the same of the newest image, outages and missed detections left out."""
+    """(n, k), whether the newest image could show one; outages and missed detections do not
+    count."""
     obeying: Any
     """(n, k), whether the vehicle flies setpoints."""
     unasked: Array
     """(n, k), setpoints sent without an offboard call."""
     shown: Any = None
-    """(n, k), how many of the others images since the last tick showed."""
+    """(n, k), number of other vehicles in the images since the last tick."""
     edges: Any = None
     """(n, k), how many it follows."""
     positions: Any = None
@@ -191,7 +192,7 @@ Reduction = Callable[..., Any]
 
 
 class Figure(NamedTuple):
-    """A figure of a scenario: of which measure, and over runs and over the followers of one."""
+    """A figure of a scenario: its measure, and how it is combined over runs and over followers."""
 
     measure: str
     over_runs: Reduction
@@ -275,7 +276,7 @@ def measure(flights: Flights) -> Measures:
 
 
 def of_runs(rows: Measures, flights: Flights) -> Measures:
-    """Return the measures of the runs of a flock, of those of its followers, and some more."""
+    """Return the measures of the runs of a flock: of its followers combined, and of the flock."""
     kept = _find_counted(flights)
     by_run = len(flights.positions), -1
     tracking = flights.state == STATES.index(State.TRACK)
@@ -336,13 +337,13 @@ def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float,
 
 
 def _stretches(values: Any) -> Any:
-    """Return the first and the last + 1 index (m, 2) of each stretch of True."""
+    """Return the first index and the last index + 1, (m, 2), of each stretch of True."""
     edges = np.diff(np.concatenate([[False], values, [False]]).astype(int))
     return np.flatnonzero(edges).reshape(-1, 2)
 
 
 def _longest_run(missing: Array, at_the_end: bool = False) -> int:
-    """Return the greatest number of consecutive True values, or of those at the end."""
+    """Return the greatest number of consecutive True values, anywhere or at the end."""
     lengths = np.diff(_stretches(missing)).ravel()
     if at_the_end:
         return int(lengths[-1]) if missing[-1] else 0

@@ -77,7 +77,7 @@ class RealTimeFlight:
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
     :param camera: None: images have no pixels, for a detector that is simulated.
-    :param latest_ns: images that are later than this are skipped.
+    :param latest_ns: an image that is later than this is skipped.
     :param leader: a leader flown elsewhere; None: the scenario's own leader.
     """
 

@@ -43,8 +43,8 @@ class ScenarioRun:
     """
     One run of a scenario, at any time of it, s; before 0 the leader hovers in its first place.
 
-    Only latency and light changes of ``sensing`` are used. Its noise and recall are not: the real
-    perception processes rendered images, and has its own.
+    Only latency and light changes of ``sensing`` are used. Its noise and recall are not used,
+    because the real perception processes rendered images.
 
     :param in_place: whether the follower starts at the scenario's place; else the scenario is
         moved to its place, height and heading once it is in offboard mode.
@@ -122,7 +122,7 @@ class ScenarioRun:
         """
         Return the delay of the next image, s.
 
-        That is the latency of the scenario, which varies by a tenth, without that of the nodes.
+        This is the latency of the scenario, varied by 10 %, minus the latency of the nodes.
         """
         latency = self._latency * (1.0 + self._latency_rng.uniform(-0.1, 0.1))
         return float(max(latency - PROCESSING, 0.0))

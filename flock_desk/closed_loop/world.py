@@ -15,8 +15,9 @@
 """
 Surroundings of a scenario's followers: leader, air, vehicles, odometry, stepped by COURSE_STEP.
 
-Nothing here plans or reads a clock; the caller passes in the setpoints. Every
-follower is a row: those of the first run by their numbers, then those of the second, and so on.
+Nothing here plans or reads a clock; the caller passes in the setpoints. Each follower is a row:
+first the followers of the first run in the order of their numbers, then those of the second run,
+and so on.
 """
 
 from __future__ import annotations
@@ -204,7 +205,7 @@ class World:
             self._sense(now)
 
     def placed(self, now: float) -> float:
-        """Return the time, s, at which odometry of now has arrived."""
+        """Return the time, s, at which the odometry of now arrives."""
         here = bool(self._odometry) and self._odometry[0][0].stamp == now
         return now if here else self._due.next
 
@@ -246,8 +247,8 @@ class World:
         """
         Return each vehicle's position, velocity, yaw, and its autopilot's velocity and height, m.
 
-        The height is that of its barometer, which rests on no odometry. To be called once in every
-        control cycle: each call is a new sample of the noise.
+        The height is the barometer's, independent of odometry. Call this once per control cycle:
+        each call draws new noise.
         """
         vehicle = self.vehicle
         return list(zip(vehicle.position, vehicle.velocity, vehicle.yaw.tolist(),
@@ -259,7 +260,7 @@ class World:
         self._coming.append((self.step, setpoints))
 
     def _take_setpoints(self, k: int) -> None:
-        """Let setpoints arrive that were sent as long ago as the vehicle of their row lags."""
+        """Let setpoints arrive that were sent one delay of their vehicle ago."""
         accelerations, yaws = self._flown
         arrived = False
         for sent, setpoints in self._coming:

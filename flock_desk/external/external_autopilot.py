@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The links on which external autopilots report the place of the vehicles that they fly.
+The links on which external autopilots report the poses of their vehicles.
 
-In one flight they fly the follower, perhaps its leader. Each has its own link. Both vehicles share
-a frame, ENU from the follower's first reported place, since both truths are latitude, longitude
-and height.
+An external autopilot flies the follower; a second one, with a link of its own, can fly the leader.
+Both vehicles share a frame, ENU from the follower's first reported place, since both truths are
+latitude, longitude and height.
 
 A separate thread receives, since messages of ground truth have no time: their time is that of
 arrival. The link requests the messages that it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
@@ -56,13 +56,13 @@ LANDED: Final[str] = 'EXTENDED_SYS_STATE'
 ASK_PERIOD: Final[float] = 2.0
 """s between requests of the messages."""
 TRUTH_TIMEOUT: Final[float] = 6.0
-"""s of received messages without a truth, after which the estimate is used."""
+"""s without ground truth after the first message; then the estimate is used."""
 POSE_TIMEOUT: Final[float] = 30.0
 """s for the first pose of a vehicle."""
 REPORTED_SILENCE: Final[float] = 0.5
 """s without a pose, after which it is reported."""
 LOST: Final[float] = 10.0
-"""s without a pose of the follower after which there is nothing to simulate."""
+"""s without a pose of the follower; then the simulation ends."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 # The truth of each; an autopilot may complain of messages that it does not know.
@@ -124,7 +124,7 @@ class ExternalAutopilot:
             if received > TRUTH_TIMEOUT and not self.motion.source:
                 if why_truth:
                     raise ValueError(f'{self.parameter} = {self.url!r}: {self.silence()}; its own '
-                                     f'estimate will not do where {why_truth}')
+                                     f'estimate is not sufficient: {why_truth}')
                 self.motion.source = ESTIMATE
             if now > deadline:
                 raise ValueError(f'{self.parameter} = {self.url!r}: no pose of a vehicle within '
@@ -218,7 +218,7 @@ class ExternalVehicles:
         """
         Wait until the positions of the vehicles are known.
 
-        :param forwarded: whether the follower is sent odometry made of where it is.
+        :param forwarded: whether the follower receives odometry that is made from its own pose.
         :param wanted: returns whether to go on waiting.
         :raises ValueError: if a vehicle sends no pose, or no truth although it has to.
         """
@@ -260,7 +260,7 @@ class ExternalVehicles:
             f'{self.follower.silence()}')
 
     def stalled(self, now: float, time_ns: int) -> str:
-        """Return, for people, which poses are missing at a time of the flight; '' for none."""
+        """Return a text that names the poses missing at a time of the flight; '' for none."""
         problems = []
         for name, link in self._links:
             # Whether the leader's poses reach up to now is known a little later.

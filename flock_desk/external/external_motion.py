@@ -87,7 +87,7 @@ class ExternalMotion:
         return self.source == ESTIMATE
 
     def take(self, message: Any, now: int) -> None:
-        """Take a message of the autopilot received at ``now``, ns; most are of no concern."""
+        """Take a message of the autopilot received at ``now``, ns; most messages are ignored."""
         kind = message.get_type()
         if kind in TRUTHS and self.source in ('', kind):
             self._truth(message, now)
@@ -121,7 +121,8 @@ class ExternalMotion:
         """
         Return the motion at a time, ns, interpolated, also if ``knows`` is False.
 
-        Before the first pose it is that one, after the last one the last: nothing is extrapolated.
+        Before the first pose the first pose is returned, after the last pose the last: nothing is
+        extrapolated.
 
         :raises ValueError: if no pose has come yet.
         """

@@ -24,7 +24,7 @@ Flocks of point agents under the law or its predecessors: from a start to arrays
 flocks. Vicsek's rule (Vicsek et al. 1995) is in discrete time, without noise, in two readings: in
 the literal one each agent keeps its own speed and takes the mean heading of the agents within a
 radius, itself included. The paper's figure of three agents, whose speeds become equal, fits only
-the other: each takes their mean velocity.
+the other reading: each agent takes the mean velocity of these agents.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams
     :param duration: s to simulate; :param sample_period: s between the times returned, at least
         0.1 s for Vicsek's rule.
     :raises ValueError: for an unknown model, bad shapes or values, or a start outside the band.
-    :raises RuntimeError: if no finite solution goes on.
+    :raises RuntimeError: if the solution does not stay finite.
     """
     if model not in get_args(Model):
         raise ValueError(f'model = {model!r}: must be one of {", ".join(get_args(Model))}')

@@ -15,8 +15,8 @@
 """
 The law on a neighbor graph, for flocks larger than one band can hold.
 
-With every pair in the sum, every pair must stay inside (d0, d1): no more than a handful of agents
-fit, and one pair outside is drawn to r^2 = d1, where the law is singular. Here
+If every pair is in the sum, every pair must stay inside (d0, d1): only a handful of agents fit,
+and a pair outside is drawn to r^2 = d1, where the law is singular. Therefore
 
 * an edge joins two agents that start with r^2 < d1, or later come as near as
   r^2 < d0 + 0.8 (d1 - d0), and is never dropped: alignment, separation and cohesion act on edges;

@@ -51,7 +51,7 @@ def guarded(command: Callable[[], int], refused: int = 1,
     Run a command and return its exit code; an error is one line on stderr.
 
     :param refused: the exit code of an error: a wrong file, an option, a machine that is too busy.
-    :param hint: returns where to look for more, or '', if the error is not a wrong value.
+    :param hint: returns a place to look, or '', for an error that is no wrong value.
     """
     below = '\n' if sys.stderr.isatty() else ''  # the live line
     try:

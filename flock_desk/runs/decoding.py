@@ -34,7 +34,7 @@ def decoded_ahead(messages: Iterable[BagMessage], topics: Collection[str]
     """
     Yield messages in their order, each image of the topics decoded; None if that is impossible.
 
-    OpenCV decodes without Python's lock, so that a second core does it.
+    OpenCV releases Python's lock while it decodes, so a second core is used.
     """
     waiting: deque[tuple[BagMessage, Future[DecodedImage | None] | None]] = deque()
     images = 0
@@ -52,7 +52,7 @@ def decoded_ahead(messages: Iterable[BagMessage], topics: Collection[str]
 
 
 def _decode(message: BagMessage) -> DecodedImage | None:
-    """Return the decoded image; None if it is damaged: the user decodes it again for the error."""
+    """Return the decoded image; None if damaged: the caller decodes again for the error."""
     try:
         image = deserialize(message.data, message.msgtype)
         start = time.thread_time()

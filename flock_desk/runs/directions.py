@@ -43,8 +43,9 @@ def along_law(commands: Iterable[Any], neighbors: Sequence[OdometryState],
     """
     Return whether each command points along the law, horizontally.
 
-    The guard and the limits change the law's length and direction, but seldom turn it round.
-    Commands that rest on no estimate, or on one without odometry at its stamp, are left out.
+    The guard and the limits change length and direction of the law's command, but seldom reverse
+    it. Commands without an estimate, or with an estimate that has no odometry at its stamp, are
+    left out.
 
     :param neighbors: as published. :param own: the odometry.
     """
@@ -67,11 +68,12 @@ def opposed(log: Mapping[str, Array], commands: Sequence[tuple[float, Any]]) -> 
     """
     Return whether each setpoint points against its command or along the velocity.
 
-    With fresh commands: horizontally against each of them, and not against the velocity either,
-    because the gate may brake, and on a busy machine rests on a command before the newest; its
-    vertical part holds the offset of the thrust. Without a command: along the velocity, because
-    the gate brakes. A wrong sign turns almost all round. Setpoints between the two cases, and
-    those that rest on too little, are left out.
+    With fresh commands a setpoint counts if it points horizontally against each of them, and not
+    against the velocity: the gate may brake, and on a busy machine it uses a command before the
+    newest. The vertical part is not compared, because it contains the offset of the thrust.
+    Without a command a setpoint counts if it points along the velocity, because the gate brakes. A
+    wrong sign reverses almost all setpoints. Setpoints between the two cases, and very small
+    setpoints, commands or velocities, are left out.
 
     :param log: the autopilot's: times, s, setpoints and velocities (n, 3), ENU.
     :param commands: as published, each with its time of arrival, s, on the same clock.

@@ -16,9 +16,9 @@
 One bag through perception, planner and gate, and the record of it.
 
 Each message is processed at its recording time, so images and odometry have the latency and the
-order of the flight. The planner is engaged and the vehicle armed, in the air and in offboard
-mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
-``odom`` replace them if ``velocity_source`` requires them.
+order of the flight. From the first message on the planner is engaged, and the vehicle is armed, in
+the air and in offboard mode. A bag has no velocity and yaw of the autopilot: if
+``velocity_source`` requires them, those of ``odom`` are used.
 """
 
 from __future__ import annotations

@@ -63,11 +63,11 @@ FIGURES: Final[dict[str, Figure]] = {
     'duration_s': Figure('duration, s', True, external=('planned', None), load=UNBOUNDED),
     'frames': Figure('images', True),
     'frames_in_view': Figure('images with the leader in view'),
-    'processed_share': Figure('share of images looked at in time', demo=(0.9, None),
+    'processed_share': Figure('share of images processed in time', demo=(0.9, None),
                               load=UNBOUNDED),
     'recall': Figure('share of images in view with an estimate (recall)', True, fly=(0.9, None),
                      load=UNBOUNDED),
-    'recall_of_processed': Figure('share of images looked at with an estimate',
+    'recall_of_processed': Figure('share of processed images with an estimate',
                                   demo=(0.99, None)),
     'longest_gap_in_view_s': Figure('longest time without an estimate, leader in view, s',
                                     fly=(None, 0.5), load=UNBOUNDED),
@@ -125,7 +125,7 @@ FIGURES: Final[dict[str, Figure]] = {
     'setpoints': Figure('setpoints', True),
     'setpoints.sent': Figure('sent', demo=(1, None), load=UNBOUNDED),
     'setpoints.rate_hz': Figure('rate, Hz', demo=(19.5, 30.5), load=UNBOUNDED),
-    'setpoints.opposed_share': Figure('share against their command, or along the velocity without',
+    'setpoints.opposed_share': Figure('share against the command; without one, along the velocity',
                                       demo=(None, 0.5), fly=(None, 0.5), external=(None, None)),
     'setpoints.acceleration_max_m_s2': Figure('greatest acceleration, m/s²', True,
                                               demo=(None, 'a_max'), fly=(None, 'a_max')),
@@ -180,12 +180,12 @@ FIGURES: Final[dict[str, Figure]] = {
 
 
 def parts_of(key: str) -> list[str]:
-    """Return the groups of a key, and its figure; a dot between digits is that of a number."""
+    """Return the groups of a key, and its figure; a dot between digits belongs to a number."""
     return re.split(r'\.(?!\d)|(?<!\d)\.', key)
 
 
 def words(key: str) -> str:
-    """Return name and unit of a figure or group; of one that is not in the table, its key."""
+    """Return name and unit of a figure or group; the key if it is not in the table."""
     last = parts_of(key)[-1]
     for known in (key, last):
         if known in FIGURES:

@@ -125,7 +125,7 @@ def own(values: Mapping[str, T], namespace: str) -> dict[str, T]:
 
 
 def spacing(scenario: Scenario) -> float:
-    """Return the distance between two vehicles of a column at its start, m: the mean one."""
+    """Return the mean distance between two vehicles of a column at its start, m."""
     return float(np.mean(scenario.start.distance))
 
 
@@ -284,7 +284,7 @@ def with_detector(parameters: Mapping[str, list[str]], detector: Path) -> dict[s
     """
     Return the parameters of the nodes with another detector, a program, among them.
 
-    The neighbors' file has its name with .yaml; the simulator draws an AprilTag for it.
+    The neighbors' file has the detector's name with .yaml; the simulator draws an AprilTag.
     """
     neighbors = f'neighbors_file:={detector.with_suffix(".yaml").resolve()}'
     added = {'relative_pose': neighbors, 'planner': neighbors,
@@ -323,9 +323,9 @@ def watch(processes: Processes, duration: float, external: bool
 
     The last two are those of ``Flown``.
 
-    The simulator of an embedded vehicle ends with the scenario. That of an external one ends when
-    the vehicle is disarmed, which is not waited for here; the scenario has also ended if the
-    bridge reports so.
+    The simulator of an embedded vehicle ends with the scenario. The simulator of an external
+    vehicle ends when the vehicle is disarmed; this function does not wait for that. The scenario
+    has also ended if the bridge reports so.
 
     :raises RuntimeError: if the simulator ends early.
     """
@@ -376,7 +376,7 @@ def call(processes: Processes, service: str, value: Sequence[str] = ('true',),
     Call a service.
 
     :param value: see ``Processes.ask``.
-    :raises LateError: if it goes on refusing, with the reason.
+    :raises LateError: if the service continues to refuse, with the reason.
     :raises RuntimeError: if the simulator has ended, or a node has.
     """
     simulators = simulators_of(processes)

@@ -15,22 +15,23 @@
 """
 Errors of the estimates against the truth: one row per image and neighbor.
 
-Errors are those of the neighbor's state relative to the follower, each in its follower's body
-frame (FLU): estimate minus ego odometry against truth minus truth, so that drift, which is common
-to leader and follower in odom, does not count. Their covariances follow from the published ones.
+Errors are those of the neighbor's state relative to the follower, in the follower's body frame
+(FLU): (estimate - ego odometry) - (true neighbor - true follower). Drift of the odometry, which
+leader and follower have in common, does not count. The covariances of the errors follow from the
+published ones.
 
-- Position: z = R' (p_L - p_F). The filter measures p_L relative to the ego position, and its
-  covariance P_p is that of the leader relative to it: the error of p_F is in p_L too and cancels.
-  P = R' P_p R.
-- Velocity: z = R' (v_L - v_F). The filter takes v_L from positions measured relative to a point
-  that moves with the integral of v_F, so v_L follows the true velocity plus the error of v_F,
-  which cancels as far as v_L has followed it. The lag is in P_v, because the random walk of that
-  error is part of the filter's noise (``odometry_noise``). P = R' P_v R; the covariance of the
-  odometry's velocity, added, would count it twice. Its white noise, as measured, is in P_v.
+- Position: z = R' (p_L - p_F). The filter measures p_L relative to p_F, so p_L contains the error
+  of p_F, which cancels in z. The filter's covariance P_p is that of the relative position: P = R'
+  P_p R.
+- Velocity: z = R' (v_L - v_F). The filter derives v_L from positions relative to a point that
+  moves with the integral of v_F. So v_L converges to the true velocity plus the error of v_F,
+  which cancels in z after this convergence. The lag is in P_v, because the filter's noise contains
+  the random walk of that error (``odometry_noise``), and P_v contains the measured white noise of
+  v_F. So P = R' P_v R; adding the covariance of the odometry's velocity would count it twice.
 
 P_v is the filter's covariance of the velocity in odom. The covariance in the message is that of
-the twist in the leader's body, so it also holds the error of the leader's attitude, of which the
-velocity in odom is free.
+the twist in the leader's body frame: it also contains the error of the leader's attitude, and is
+not used here.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> 
     """
     Refuse a bound on a name that is no figure of the summary.
 
-    :raises ValueError: naming it, and the figures of similar names, or all.
+    :raises ValueError: naming the unknown name, and the figures of similar names, or all figures.
     """
     figures = [key for key, value in flat(summary) if not isinstance(value, (str, list))]
     for bound in bounds:

@@ -17,7 +17,7 @@ The signs of commands and setpoints, judged without a clock.
 
 On a busy machine a flight through the nodes may send too little to judge a sign by, or not even
 begin. Then filter, planner and gate fly a few seconds in lock step, behind a leader that leaves:
-no load changes that flight. A fault in a node itself is not in it.
+load does not change that flight. It does not show a fault in a node itself.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ _ABOVE: dict[str, Any] = {
 
 
 def styled() -> Any:
-    """Return the context of a block or a function in which no user's matplotlibrc counts."""
+    """Return a context in which the user's matplotlibrc has no effect."""
     return style.context(['default', _STYLE])
 
 
@@ -133,7 +133,7 @@ def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Fi
 
 @styled()
 def distances(runs: Runs, end: float, note: str = '') -> Figure:
-    """Return the distances between agents up to a time, s, and the bounds; each to its scale."""
+    """Return distances between agents up to a time, s, and the bounds, each with its own scale."""
     def draw(axis: Axes, run: Simulation) -> None:
         m = run.metrics
         last = int(np.searchsorted(m.time, end))
@@ -160,9 +160,9 @@ def distances(runs: Runs, end: float, note: str = '') -> Figure:
 @styled()
 def agreement(runs: Runs, end: float) -> Figure:
     """
-    Return W of the first run, the law's, and how the velocities of all runs come to agree.
+    Return W of the first run (the law), and the velocities' disagreement in all runs.
 
-    A dot is where their disagreement has fallen below 1 % of the first for good.
+    A dot marks the time from which the disagreement stays below 1 % of its first value.
     """
     figure = Figure(figsize=(COLUMN_WIDTH, 3.6), layout='constrained')
     above, below = figure.subplots(2, 1, sharex=True)

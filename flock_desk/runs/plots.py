@@ -89,7 +89,7 @@ def chapters(flight: Flight, note: str = '') -> list[Chapter]:
 
 
 def _with_gaps(table: Table) -> Mapping[str, Array]:
-    """Return a table with a row of NaN if images are missing, and so no line."""
+    """Return a table with a row of NaN in each gap of the images: no line crosses the gap."""
     breaks = np.flatnonzero(np.diff(table['time']) > MAX_LINE_GAP) + 1
     return {name: np.insert(column, breaks, np.nan, axis=0) for name, column in table.items()}
 

@@ -162,9 +162,9 @@ class Processes:
     """
     A group of child processes with a log file each; leaving the ``with`` block stops them all.
 
-    So do SIGTERM and SIGHUP (a closed terminal, a job past its time) to the process that is in the
-    block, where its main thread is. Against SIGKILL of that process there is no help. Inside the
-    block a thread measures the ``load``; what comes too late on a busy machine is a TooBusyError.
+    SIGTERM and SIGHUP (a closed terminal, a job past its time) to the process whose main thread is
+    in the block stop them, too. SIGKILL of this process leaves them running. Inside the block a
+    thread measures the ``load``; what comes too late on a busy machine is a TooBusyError.
 
     :param environment: the children's environment, see :func:`private_environment`.
     :param log_folder: where ``NAME.log`` holds each child's stdout and stderr.
@@ -274,8 +274,8 @@ class Processes:
         """
         Send SIGINT, wait, and return the exit code; None if SIGKILL was needed.
 
-        1 if it ended earlier by itself and should not. The time for which it waits for a processor
-        is added to ``timeout``; TOO_BUSY_EXIT_CODE if it was cut off all the same.
+        1 if it ended earlier by itself and should not. The time for which the child waits for a
+        processor is added to ``timeout``; TOO_BUSY_EXIT_CODE if it was ended nevertheless.
         """
         child = self.children[name]
         try:

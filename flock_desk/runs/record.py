@@ -59,17 +59,16 @@ class Flight:
     """
     A flight behind one neighbor; times in s from its beginning, vectors in odom.
 
-    ``table`` is that of ``frame_errors``, n images; ``paths`` (n, 2) or (n, 3), m, are the
-    leader's and the follower's at these, ``speeds`` times (m,) and speeds (m,), m/s, each by its
-    label; the first is the vehicle that flew the setpoints. ``setpoints`` (k, 3), m/s^2, were sent
-    at ``setpoint_times`` (k,), for lack of a command if ``commanded`` (k,) is False. ``states``
-    are the planner's, with the times at which it entered them. ``blind`` holds the times in which
-    the leader could not be seen, from and to.
+    ``table`` is the table of ``frame_errors`` for n images. ``paths`` holds the positions of
+    leader and follower at these images, (n, 2) or (n, 3), m, by label. ``speeds`` holds times (m,)
+    and speeds (m,), m/s, by label; the first label is the vehicle that flew the setpoints.
+    ``setpoints`` (k, 3), m/s^2, were sent at ``setpoint_times`` (k,); if ``commanded`` (k,) is
+    False, without a command. ``states`` are the planner's states with the times of entry.
+    ``blind`` holds the intervals in which the leader could not be seen.
 
-    Of a flight through the nodes: ``distance`` holds true distances, m, as often as they are
-    known; ``diagnostics`` the arrays published, each with its time; ``command_times`` are those
-    for which the planner commanded, s on the bag's clock; ``along_law`` and ``opposed``: see
-    ``directions``.
+    A flight through the nodes also has: ``distance``, the known true distances, m;
+    ``diagnostics``, the published arrays with their times; ``command_times``, the ticks of the
+    planner's commands, s on the bag's clock; ``along_law`` and ``opposed``, see ``directions``.
     """
 
     name: str = LEADER_NAME
@@ -192,7 +191,8 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
     """
     Return the flight of a scenario that `fly` recorded in a folder.
 
-    :param namespace: of its nodes; others publish their diagnostics on the same topic.
+    :param namespace: of the flight's nodes; other nodes publish their diagnostics on the same
+    topic.
     :raises BagError: if its record cannot be read.
     :raises LateError: if the scenario never began, no image was made, or nothing was written.
     """
@@ -246,7 +246,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
 
 
 def _cut(log: dict[str, Any], images: Any, states: Any, clock: Any) -> None:
-    """Cut a log to the images, states and times of the clock that masks select."""
+    """Keep those images, states and clock times of a log that the masks select."""
     log['clock'] = log['clock'][clock]
     for name in log:
         if name.startswith(('image_', 'follower_', 'leader_')):

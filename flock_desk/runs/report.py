@@ -78,7 +78,7 @@ class Chapter(NamedTuple):
 
 
 def table(summary: Mapping[str, Any], judgments: Sequence[Judgment]) -> list[str]:
-    """Return the lines of the figures shown, bounds and verdicts beside those that have one."""
+    """Return the table of the shown figures, with bound and verdict if a figure has a bound."""
     judged = {judgment.bound.key: judgment for judgment in judgments}
     figures = {key: value for key, value in flat(summary)
                if key in judged or (value is not None and shown(key))}
@@ -199,7 +199,7 @@ def _chapter(chapter: Chapter) -> str:
 
 
 def _group(group: str, figures: Mapping[str, Any]) -> str:
-    """Return the table of a group of figures; of '', those in no group."""
+    """Return the table of a group of figures; '': the figures in no group."""
     rows = []
     for key, value in flat(figures, f'{group}.' if group else ''):
         shown_value = '<br>'.join(filter(None, [escape(text(value)), _verdict(key, value)]))

@@ -14,7 +14,7 @@
 
 
 """
-The figures of a flight, computed: those that ``evaluate``, ``demo`` and ``fly`` share, and others.
+Compute the figures of a flight for ``evaluate``, ``demo`` and ``fly``.
 
 A summary is a mapping of figures by name, groups of them nested; None is unknown. Words, units
 and bounds are in ``figure_table.py``.
@@ -58,12 +58,12 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     """
     Return how often and how well neighbors were measured, from the tables of ``frame_errors``.
 
-    Images count once for each neighbor. ``recall`` is the share with an estimate, of those in
-    which the truth has a marker in view, or of all without a truth. Errors are over all
-    images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
-    estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of
-    a track: the planner refuses them. ``velocity_rms_of_all_m_s`` does not. ``nees_`` are means,
-    3 if covariances are right.
+    Images count once for each neighbor. ``recall`` is the share of images with an estimate, among
+    the images in which the truth has a marker in view, or among all images if there is no truth.
+    Errors are computed from all images with an estimate and truth. ``velocity_rms_m_s`` and
+    ``velocity_bias_m_s`` leave out the estimates that the planner refuses: those with a velocity
+    more uncertain than ``max_velocity_std``, m/s, for example the first of a track.
+    ``velocity_rms_of_all_m_s`` includes them. ``nees_`` are means; 3 is right.
     """
     rows = {column: np.concatenate([table[column] for table in tables]) for column in tables[0]}
     found, known = np.isfinite(rows['distance']), np.isfinite(rows['true_distance'])
@@ -103,7 +103,8 @@ def hold_figures(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[fl
     Return number and total time of the planner's HOLDs from time 0 to an end, s, and each of them.
 
     :param states: those entered, each with its time.
-    :param reasons: those reported, each with its time; of a HOLD the first one reported during it.
+    :param reasons: the reported reasons with their times; the first one reported during a HOLD
+    counts.
     """
     total, holds = 0.0, dict[str, str]()
     for (begin, state), (until, _) in zip(states, [*states[1:], (end, '')]):
@@ -122,9 +123,9 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
 
     Beside :func:`sight_figures`: ``cpu_ms_per_frame`` is the CPU time of perception without
     decoding; under ``timings`` it is by the costliest stage an image needed.
-    ``own_speed_max_m_s`` is that of the follower in the bag, ``faster_than_v_max_share`` the share
-    of ticks in which it was too fast. ``check`` holds the errors and the warnings of the rules of
-    ``check``, a line each.
+    ``own_speed_max_m_s`` is the highest speed of the follower in the bag,
+    ``faster_than_v_max_share`` the share of ticks above ``v_max``. ``check`` holds the errors and
+    warnings of ``check``, a line each.
     """
     tables = [*evaluation.tables.values()]
     stages = np.concatenate([np.where(np.isfinite(table['distance']), table['stage'], 0.0)
@@ -173,13 +174,12 @@ def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None],
     """
     Return the figures that ``demo`` and ``fly`` have in common, NaN if they are unknown.
 
-    ``true_distance_m`` is that of ``flight.distance``. ``setpoints`` are those on the wire,
-    ``speed_max_m_s`` is the vehicle's, ``latency_ms`` from an image's stamp to MAVLink, as the
-    bridge counts it. ``holds`` are those of the planner, each with its reason.
-    ``failed_processes`` counts those that did not end with 0 in time, but for ``late_processes``,
-    which waited for a processor until they were cut off. ``along_law_share`` is that of the
-    commands, None of fewer than ``COMMANDS``; ``opposed_share`` is that of at least so many
-    setpoints. ``machine``: the other programs on it during the
+    ``true_distance_m`` is from ``flight.distance``, ``setpoints`` from the wire, ``speed_max_m_s``
+    from the vehicle. ``latency_ms`` is the time from an image's stamp to MAVLink, measured by the
+    bridge. ``holds`` lists each HOLD of the planner with its reason. ``late_processes`` waited for
+    a processor until they were ended; ``failed_processes`` counts the others that did not end with
+    0 in time. ``along_law_share`` is None for fewer than ``COMMANDS`` commands; ``opposed_share``
+    counts at least ``COMMANDS`` setpoints. ``machine`` describes the other programs during the
     worst 2 s, None if unknown.
 
     :param load: of the flight, None if unknown.
@@ -219,7 +219,7 @@ def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None],
     Return the summary of ``demo``.
 
     Beside :func:`flight_figures`: ``processed_share`` is the share of the bag's images that
-    perception processed in time; ``recall_of_processed`` is that of these.
+    perception processed in time; ``recall_of_processed`` is the recall of these images.
     """
     common = flight_figures(flight, exit_codes, load)
     processed = flight.value('relative_pose', 'images_processed', math.inf) / common['frames']
@@ -236,15 +236,15 @@ def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
     """
     Return the summary of ``fly``.
 
-    Beside :func:`flight_figures`: ``time_in_band_share`` is of all times,
-    ``longest_gap_in_view_s`` the longest time without an estimate in which all images showed the
-    leader; ``planner.warnings`` counts the times it published any, and ``warning`` is the first.
-    ``outages``: the times until the planner held, and followed again. ``altitude_off_m`` is the
-    greatest distance from the leader's height, see :func:`_altitude_off`. ``problems`` counts the
-    problems that each node reported, in seconds. ``external``: of an external autopilot, the
-    source of the vehicle's pose, and the rate of its clock by ours; the source of the leader's
-    pose, if another one flew that, too; and the reason why the bridge ended the flight early, if
-    it did.
+    Beside :func:`flight_figures`: ``time_in_band_share`` counts all times.
+    ``longest_gap_in_view_s`` is the longest time without an estimate in which all images showed
+    the leader. ``planner.warnings`` counts the diagnostics with a warning; ``warning`` is the
+    first of these. ``outages``: the times until the planner held, and until it followed again.
+    ``altitude_off_m`` is the greatest distance from the leader's height, see
+    :func:`_altitude_off`. ``problems`` counts the problems that each node reported, in seconds.
+    ``external`` describes an external autopilot: the source of the vehicle's pose, the rate of its
+    clock relative to ours, the source of the leader's pose if a second autopilot flew the leader,
+    and the reason if the bridge ended the flight early.
 
     :param cores: used by each process, empty if unknown.
     :param speed: of a processor, as a share of the reference; None if unknown.
@@ -308,7 +308,7 @@ def outage_name(outage: Outage) -> str:
 
 
 def judged_outages(flight: LiveFlight) -> list[Outage]:
-    """Return the outages long enough, and flown far enough, to demand HOLD."""
+    """Return the outages that are long enough, and were flown long enough, to require HOLD."""
     return [outage for outage in flight.scenario.outages if outage.duration >= hold_within(outage)
             and flight.duration >= outage.at + hold_within(outage)]
 
@@ -333,7 +333,7 @@ def _problems(flight: LiveFlight) -> dict[str, int]:
 
 
 def _longest_time(times: Array, holds: Any) -> float:
-    """Return the longest time, s, at whose images (n,) something holds, from the one before."""
+    """Return the longest time, s, in which ``holds`` (n,) is True, from the image before it."""
     longest, since = 0.0, math.inf
     for time, held in zip(times.tolist(), holds.tolist()):
         since = min(since, time) if held else time

@@ -16,12 +16,12 @@
 The courses of simulated leaders, sampled ahead of the flight with bounded jerk, and the wind.
 
 Each motion is the velocity (n, 3) of a leader at times (n,), s, from rest: away from where the
-follower begins, to the left, up. In three dimensions, drawn by chance, the speed is at most
-``speed``, up and down at most ``climb``, and the acceleration is bounded likewise; the height
-stays within ``height`` of the first.
+follower begins, to the left, up. In random three-dimensional motions the level speed is at most
+``speed``, the vertical speed at most ``climb``; the accelerations are bounded in the same way, and
+the height stays within ``height`` of the first height.
 
-Speeds change the way a trapezoid of acceleration does: a step in speed, averaged over two windows
-of T1 = dv / a and T2 = a / j, has an acceleration of at most a and a jerk of at most j.
+Speeds change with a trapezoidal acceleration: a step in speed, averaged over two windows of T1 =
+dv / a and T2 = a / j, has an acceleration of at most a and a jerk of at most j.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Course:
         """
         Return position, velocity, acceleration (3,) and heading at a time, s.
 
-        Beyond the end they are those of the end.
+        Beyond the end the values of the end are returned.
         """
         last = len(self.positions) - 1
         share, whole = math.modf(min(max(time / COURSE_STEP, 0.0), float(last)))
@@ -141,7 +141,7 @@ def _legs(motion: LeaderMotion, _: float, times: Array, rng: np.random.Generator
 
 
 def _speed(motion: LeaderMotion, speed: float, times: Array) -> Array:
-    """Return the speed (n,) from rest to ``speed``, half of the acceleration left for turning."""
+    """Return the speed (n,) from rest to ``speed``; half of the acceleration is for turning."""
     return _smooth(np.where(times > 0.0, speed, 0.0), 2.0 * speed, motion)
 
 
@@ -199,7 +199,7 @@ def stairs(climb: float, level: float, height: _Height,
 
 def approach(climb: float, level: float, height: _Height,
              rng: np.random.Generator) -> Iterator[Stretch]:
-    """Yield a flight away for 2 to 6 s and back the way it came, faster, up or down meanwhile."""
+    """Yield flights away for 2 to 6 s, and back on the same path, faster, and up or down."""
     while True:
         duration, heading = rng.uniform(2.0, 6.0), rng.uniform(-0.6, 0.6)
         for share, turned in ((rng.uniform(0.4, 0.8), 0.0), (1.0, math.pi)):
@@ -226,8 +226,9 @@ def spline(motion: LeaderMotion, speed: float, times: Array, rng: np.random.Gene
     """
     Return the velocities (n, 3) along a uniform cubic B-spline through random points.
 
-    The points are as far apart as it flies in 1 to 1.6 s, each direction within 1.2 rad of the
-    last one; the time between two is as short as the bounds allow.
+    The distance between two points is 1 to 1.6 s times ``speed``; the direction changes by at most
+    1.2 rad from leg to leg. All legs take the same time, at least 1 s, else as short as the bounds
+    of speed and acceleration allow.
     """
     count = math.ceil(times[-1]) + 8
     headings = np.cumsum(rng.uniform(-1.2, 1.2, count))
@@ -253,7 +254,7 @@ class _Height:
         self._height = self._climb = 0.0
 
     def after(self, duration: float, climb: float) -> float:
-        """Return the vertical speed to go to for a duration, s: the one wanted, or another."""
+        """Return the vertical speed for a duration, s: ``climb`` if the height permits it."""
         for wanted in (climb, -climb, 0.0, -math.copysign(abs(climb), self._height)):
             ramp = min(abs(wanted - self._climb) / self._rate, duration)
             reached = self._climb + math.copysign(ramp * self._rate, wanted - self._climb)
@@ -267,7 +268,7 @@ class _Height:
 
 
 def _walk(steps: Array, most: float) -> Array:
-    """Return the sums (n,) of steps (n,), each turned that would lead beyond ``most``."""
+    """Return the sums (n,) of steps (n,); a step that would lead beyond ``most`` is reversed."""
     at, reached = 0.0, []
     for step in steps.tolist():
         at += step if abs(at + step) <= most else -step
@@ -276,7 +277,7 @@ def _walk(steps: Array, most: float) -> Array:
 
 
 def _ramp(durations: Array, wanted: Array, rate: float, times: Array) -> Array:
-    """Return values (n, m) at times (n,), from zero, each wanted one approached at a rate."""
+    """Return values (n, m) at times (n,), from zero; each wanted value is approached at a rate."""
     value, begin = np.zeros(wanted.shape[1]), 0.0
     knots, values = [0.0], [value]
     for duration, target in zip(durations.tolist(), wanted):

@@ -356,7 +356,8 @@ class Scenario(Part):
         """
         Return the generator of one random quantity in one run.
 
-        :param follower: its number, if each has its own; the first has that of a lone one.
+        :param follower: number of the follower, if each draws its own values; the first draws
+        those of a single follower.
         """
         whose = what if follower == 1 else f'{what}/follower_{follower}'
         return np.random.default_rng([run, zlib.crc32(f'{self.name}/{whose}'.encode())])

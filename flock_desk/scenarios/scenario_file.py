@@ -27,7 +27,7 @@ name is the scenario's. A missing key keeps its default::
     variants:
       faster: {flight: {v_max: 2}}
 
-A variant is a scenario of its own name, which differs in the keys that it has.
+A variant is a scenario with a name of its own; it contains only the keys that differ.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also if it has operations or a flock: only in lock step.
+    :raises ScenarioError: also for operations or a flock, which fly in lock step only.
     """
     scenario = load(name)
     for part in ('operations', 'flock'):
@@ -128,7 +128,7 @@ def parse(text: str, path: str, variant: str = '') -> Scenario:
 
 
 def _part(kind: Any, given: Any, where: str, before: Any = None, **more: Any) -> Any:
-    """Return one of a kind of dataclass; a missing key is as in ``before``, or the default."""
+    """Return a part of a kind, a dataclass; missing keys are as in ``before``, or the default."""
     hints, prefix = get_type_hints(kind), f'{where}.'.lstrip('.')
     allowed = [f.name for f in fields(kind) if f.name != 'name']
     if not isinstance(given, dict):

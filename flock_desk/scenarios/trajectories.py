@@ -15,11 +15,11 @@
 """
 Trajectories of a rendered flight: a leader on a winding course and its follower.
 
-The leader's speed, heading and height are sinusoids, so its acceleration is known in closed form
-and the course has no end, and leads forwards. The follower is flown in closed loop by
-the project's own law at 10 Hz, through an attitude lag, and turns its camera towards the leader,
-so that a planner's commands in replay resemble the recorded flight. For a wider range than the law
-allows, it falls back from the leader and catches up again instead (:class:`Swing`).
+The leader's speed, heading and height are sinusoids, so its acceleration is known in closed form.
+The course has no end, and leads forwards. The follower is flown in closed loop by the project's
+own law at 10 Hz, through an attitude lag, and turns its camera towards the leader, so that a
+planner's commands in replay resemble the recorded flight. For a wider range than the law allows,
+it falls back from the leader and catches up again instead (:class:`Swing`).
 
 Everything is in the odom frame (ENU, origin below the follower's start), m, s, rad. States are
 rounded at every step: differences in the last bit between processors do not grow.
@@ -214,7 +214,7 @@ def attitude(specific_force: ArrayLike, yaw: float) -> Array:
     """
     Return the attitude quaternion of a quadrotor that thrusts so and faces a yaw, rad.
 
-    :param specific_force: what the rotors must add to gravity (3,), m/s^2: acceleration and drag.
+    :param specific_force: acceleration plus drag (3,), m/s^2, without gravity.
     """
     z = np.asarray(specific_force, dtype=float) + np.array([0.0, 0.0, _GRAVITY])
     z /= np.linalg.norm(z)

@@ -19,9 +19,9 @@ There is one model of the errors, with the parameters ``VioErrors``. :class:`Vio
 velocity and yaw of n runs at once, which is what flights in lock step need; :class:`VioEstimator`
 is one run of it with attitude, angular velocity and covariances, for bags and for the nodes.
 
-The estimate starts without error. Its yaw then walks at random, and turns every further step of
-the position, which walks at random too; tilt errors stay bounded, because gravity shows them.
-Velocity and angular velocity have errors of their own.
+The estimate starts without error. Its yaw then drifts as a random walk, which rotates all later
+motion; the position has a random walk of its own. Tilt errors stay bounded, because gravity shows
+the tilt. Velocity and angular velocity have errors of their own.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Odometry(NamedTuple):
 
 
 class NormalBlocks:
-    """Standard normal vectors of n generators, drawn in blocks; no other may use these."""
+    """Standard normal vectors of n generators, which nothing else may use, drawn in blocks."""
 
     def __init__(self, generators: Sequence[np.random.Generator], size: int) -> None:
         self._generators, self._size = generators, size

@@ -18,10 +18,11 @@ ArduCopter as a companion computer uses it: GUIDED, take-off, landing, the EKF f
 Measured on ArduCopter 4.7, and by its source code, see docs/autopilots.md. On the ground setpoints
 have no effect: MAV_CMD_NAV_TAKEOFF comes first. Setpoints that it cannot fly stop the vehicle
 without a message. NaN is not checked, and no speed limit
-applies to accelerations. Without setpoints the last one is flown for GUID_TIMEOUT (3 s); then the
-vehicle stops. Unlike PX4, ArduCopter integrates an acceleration to a velocity and a position, and
-holds those: vertical acceleration 0 keeps the height. If the EKF loses its position, the vehicle
-enters LAND without a position. After landing it stays in LAND, in which it cannot be armed.
+applies to accelerations. If no setpoint arrives, the last one is flown for GUID_TIMEOUT (3 s);
+then the vehicle stops. Unlike PX4, ArduCopter integrates an acceleration to a velocity and a
+position, and holds those: vertical acceleration 0 keeps the height. If the EKF loses its position,
+the vehicle enters LAND without a position. After landing it stays in LAND, in which it cannot be
+armed.
 """
 
 from __future__ import annotations

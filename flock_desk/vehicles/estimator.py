@@ -15,10 +15,10 @@
 """
 The sensors of the embedded autopilot: its position estimator and its barometer.
 
-With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
-they are right or not, and dead-reckons with a biased accelerometer once they stop: position and
-velocity go on, and drift. The barometer measures the standard atmosphere with white noise and a
-slow drift. ENU; the time is given.
+With GPS the estimate is the truth. With vision the estimate follows the poses of ODOMETRY, right
+or wrong. Without new poses it integrates a biased accelerometer, so position and velocity drift.
+The barometer measures the standard atmosphere with white noise and a slow drift. ENU; the time is
+given.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Estimator:
     :param uses_vision: False for GPS.
     :param height_by_vision: False for the barometer: then the height follows the vertical velocity
         of the vision, and slowly the barometer.
-    :param now: time, s. A vehicle in the air begins as if vision had come until then.
+    :param now: time, s. If the vehicle starts in the air, vision counts as received until then.
     :param ready_at: the time, s, before which there is no estimate.
     """
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One flight controller, as a companion computer meets it: modes, arming, and how its modes fly.
+One flight controller, as a companion computer uses it: modes, arming, and the flight in each mode.
 
 The measured reactions are in docs/autopilots.md. ``px4`` and ``arducopter`` add their rules for
 setpoints, take-off, landing and failsafes. ENU; the time is given.
@@ -192,7 +192,7 @@ class FlightController(ABC):
                 'at rest': self.on_ground}
 
     def missing(self, mode: str, now: float, arming: tuple[str, ...] = ()) -> list[str]:
-        """Return the conditions that a mode needs, and more, as far as they are not met."""
+        """Return the conditions, those in ``arming`` and those of a mode, that are not met."""
         met = self.conditions(now)
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 

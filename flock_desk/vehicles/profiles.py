@@ -15,7 +15,8 @@
 """
 The differences of the embedded autopilots, as tables: measured, see docs/autopilots.md.
 
-Written out here, not taken from the bridge: a mistake there must not hide itself.
+The values are repeated here, not imported from the bridge: otherwise a mistake of the bridge would
+be in both.
 
 PARAM_VALUE carries every parameter in a float. PX4 puts the four bytes of an integer there,
 ArduPilot the number itself. A decoder that uses the wrong encoding reads 1 as 1.4e-45.
@@ -93,7 +94,7 @@ class Profile:
     rates: Mapping[int, float]
     """Hz, by message id; 0: only on request."""
     mode_message: int
-    """Message id that shows a change of the mode at once."""
+    """Id of the message that is sent at once after a change of the mode."""
     arming: tuple[str, ...]
     """The conditions of arming, besides those of the mode."""
     refused: int

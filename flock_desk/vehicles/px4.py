@@ -13,20 +13,20 @@
 # limitations under the License.
 
 """
-PX4, as far as a companion computer meets it: setpoints, take-off, landing, failsafes.
+PX4, as a companion computer uses it: setpoints, take-off, landing, failsafes.
 
 Measured on PX4 1.16, see docs/autopilots.md. PX4 flies the chosen mode as long as it can:
-OFFBOARD needs a setpoint within COM_OF_LOSS_T (1 s), Hold a global position, that is GPS
-or an origin. Otherwise a failsafe flies another and ends by itself when the chosen mode can
-be flown again: setpoints alone bring OFFBOARD back. After landing the mode from before is back.
-No speed limit applies to acceleration setpoints; vertical acceleration 0 leaves the height open.
-When external vision stops OFFBOARD stays, and drifts.
+OFFBOARD needs a setpoint within COM_OF_LOSS_T (1 s); Hold needs a global position, that is GPS or
+an origin. Otherwise a failsafe flies another mode, until the chosen mode can be flown again:
+setpoints alone bring OFFBOARD back. After a landing PX4 returns to the mode before it. No speed
+limit applies to acceleration setpoints; a vertical acceleration of 0 leaves the height open. If
+external vision stops, PX4 stays in OFFBOARD, and drifts.
 
-After arming the motors spin up, then idle until a setpoint demands a climb: any upward
-acceleration, however small. A ramp then limits the climb rate of PX4's modes, and leaves
-acceleration setpoints alone. The land detector looks at the thrust: it reports the
-take-off at once, and a landing only while a downward velocity is commanded. Acceleration setpoints
-command none, so that a vehicle that they push onto the ground stays in the air for PX4.
+After arming the motors spin up, then idle until a setpoint commands a climb: any upward
+acceleration, however small. A ramp then limits the climb rate of PX4's modes, but not acceleration
+setpoints. The land detector uses the thrust. It reports a take-off at once, but a landing only
+while a downward velocity is commanded. Acceleration setpoints command no velocity: if they push
+the vehicle onto the ground, PX4 reports that it is still in the air.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Px4(FlightController):
         return ACCEPTED
 
     def pilot_switches(self, name: str) -> None:
-        """Change the mode by remote control; from then on there is one."""
+        """Change the mode by remote control; from then on there is a transmitter."""
         super().pilot_switches(name)
         self._sticks = True
         self._remember(name)

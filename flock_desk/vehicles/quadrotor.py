@@ -15,8 +15,8 @@
 """
 A quadrotor that flies acceleration setpoints: thrust, tilt, gravity and the lags in between.
 
-Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It has
-one vehicle, or as many independent ones as its arrays have rows.
+Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. Its arrays
+hold one vehicle, or one independent vehicle per row.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def _maker(msgtype: str) -> Callable[[], Any]:
 
 
 def _zero(description: Any) -> Any:
-    """Return the empty value of a field; a function that makes one if it can be changed."""
+    """Return the empty value of a field, or a function that makes a mutable one."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return _maker(detail)

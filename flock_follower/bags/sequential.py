@@ -152,7 +152,7 @@ class SequentialReader:
 
 
 def overlap(files: Iterable[Span]) -> int:
-    """Return by how much a file begins before an earlier one with its topics ends, ns."""
+    """Return by how much a file begins before the end of an earlier file with its topics, ns."""
     longest, before = 0, list[Span]()
     for span in files:
         for other in before:
@@ -180,7 +180,7 @@ def in_order(files: Sequence[tuple[Span, Iterator[_Message]]]) -> Iterator[_Mess
 
 
 def _merge(files: Sequence[tuple[Span, Iterator[_Message]]]) -> Iterator[_Message]:
-    """Yield messages by their stamps; nothing is read of a file before its first one's."""
+    """Yield messages by their stamps; a file is not read before its first stamp."""
     waiting = sorted(((span.start, number, messages)
                       for number, (span, messages) in enumerate(files)), reverse=True)
     opened: list[tuple[int, int, _Message, Iterator[_Message]]] = []

@@ -145,14 +145,14 @@ class Collector:
             self.observations.pictures += [picture] if due else []
             return
         if arrival >= self._next_pair:
-            self._pair(stamp, arrival, pixels)
+            self._measure_shift(stamp, arrival, pixels)
         if due:
             picture.height, picture.width = pixels.shape
             coarse = pixels[::4, ::4]
             picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
             self._kept.append((picture, pixels))
 
-    def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
+    def _measure_shift(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
         """Measure the shift since the previous image, if the time between both is suitable."""
         reduced, before = small(pixels), self._small
         if before is not None and stamp - before[0] < PAIR_GAP[0]:

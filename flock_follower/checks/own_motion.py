@@ -87,7 +87,7 @@ EVENTS: Final = (
     ('odom changed its frames', 'odom frames', ERROR,
      'is it published by two sources? Every change starts perception anew'),
     ('odom out of order', 'odom order', WARNING,
-     'of two sources in one topic take one; messages older than the one before are not used'),
+     'if two sources publish on this topic, keep one; a message with an older stamp is not used'),
     ('odom gap', 'odom gaps', WARNING,
      'see in the log of its source why it pauses: without odometry the follower brakes'))
 #: Error of the mounting, rad, from which on there is a warning.
@@ -138,7 +138,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
         fit = fit_axes(seen.shifts, path, camera_model(seen),
                        quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL,
                        up if lean >= LEAN_ERROR else None)
-    yield from _axes(seen, motion, up, lean, fit)
+    yield from _check_axes(seen, motion, up, lean, fit)
     sure = fit if fit is not None and fit.best >= MIN_EXPLAINED else None
     yield _focal(sure, sure is not None and seen.calibration.distortion_model == 'equidistant')
     if seen.sightings:
@@ -219,8 +219,8 @@ def _twist(motion: OwnMotion) -> Finding:
         (True, OK, f'in the {twist.found} frame', ''))
 
 
-def _axes(seen: Observations, motion: OwnMotion, up: Array, lean: float, fit: AxesFit | None
-          ) -> Iterator[Finding]:
+def _check_axes(seen: Observations, motion: OwnMotion, up: Array, lean: float,
+                fit: AxesFit | None) -> Iterator[Finding]:
     """
     Check the vertical and forward axes, and the time offset.
 

@@ -206,7 +206,7 @@ def _median_square(axis: int, residuals: list[_Residuals]) -> float:
 
 
 def _running_median(values: Array) -> Array:
-    """Return the median of values (2, n) about each, (2, n)."""
+    """Return the running median (2, n) of values (2, n)."""
     half = min(NOISE_POSES, values.shape[1]) // 2
     padded = np.pad(values, ((0, 0), (half, half)), mode='reflect')
     median: Array = np.median(np.lib.stride_tricks.sliding_window_view(

@@ -122,7 +122,7 @@ class _Place(NamedTuple):
 
 
 def _judge_path(its: SourceSeen, places: list[_Place], states: list[OdometryState]) -> None:
-    """Compare the poses of a neighbor with each other, those in the frame of the newest."""
+    """Compare the poses of a neighbor that are in the frame of the newest pose."""
     its.on_body = places[-1].T_body_frame is not None
     by_stamp = {place.stamp: place.position if place.T_body_frame is None
                 else place.T_body_frame.apply(place.position) for place in places

@@ -28,7 +28,7 @@ from flock_follower.checks.flight_settings import check_settings
 from flock_follower.checks.observations import Observations, OwnMotion, TopicEnd, TopicSeen
 from flock_follower.checks.own_motion import check_own_motion
 from flock_follower.checks.pictures import check_pictures
-from flock_follower.checks.single_camera import alone
+from flock_follower.checks.single_camera import select_camera
 from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.topics import check_nodes, check_topics
 from flock_follower.files import resource
@@ -86,7 +86,7 @@ class RecordedSystem:
     def __init__(self, bag: Bag, values: Mapping[str, dict[str, Any]], camera: str = '',
                  namespace: str = '', remaps: Mapping[str, str] | None = None,
                  own: OwnMotion | None = None) -> None:
-        chosen, perception = alone(values['relative_pose'], camera)
+        chosen, perception = select_camera(values['relative_pose'], camera)
         names = names_there(namespace, {
             **topics_of_camera(chosen.image, chosen.camera_info), **(remaps or {})})
         images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
@@ -97,7 +97,7 @@ class RecordedSystem:
             namespace=namespace, names=names, incomplete=bag.incomplete,
             own=own or self._own_motion,
             parameters={**values, 'relative_pose': perception,
-                        'planner': alone(values['planner'], camera)[1]},
+                        'planner': select_camera(values['planner'], camera)[1]},
             unreadable=dict(bag.skipped), topics={
                 name: TopicSeen([TopicEnd('', topic.msgtype)])
                 for name, topic in bag.topics.items() if topic.count})

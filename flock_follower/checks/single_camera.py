@@ -22,7 +22,8 @@ from typing import Any
 from flock_follower.parameters.cameras import ALONE, cameras, CameraValues
 
 
-def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict[str, Any]]:
+def select_camera(values: Mapping[str, Any],
+                  name: str = '') -> tuple[CameraValues, dict[str, Any]]:
     """
     Return a camera by name, or the first, and the values for a system with only this camera.
 

@@ -102,8 +102,8 @@ def check_latency(seen: Observations, name: str, topic: TopicSeen,
         (unstamped > REPEATED * len(topic.stamps), ERROR, *no_stamp),
         (older > REPEATED * len(topic.stamps), ERROR,
          f'{older} of {len(topic.stamps)} are older than the message before',
-         'of two cameras, or two sources, in one topic take one; else the clock of the driver is '
-         'set back again and again'),
+         'if two cameras or sources publish on this topic, keep one; otherwise the clock of the '
+         'driver is set back repeatedly'),
         (repeated > REPEATED * len(topic.stamps), ERROR,
          f'{repeated} of {len(topic.stamps)} have the stamp of the message before',
          'have the driver stamp each message when it is measured; if each is published twice, or '

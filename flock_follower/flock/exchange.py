@@ -230,7 +230,7 @@ class Sharing:
         sender.states[vehicle] = state
         if not fits or (leap and not of_itself):
             del sender.states[vehicle]  # the next state decides
-        why = sender.unusable(received)
+        why = sender.unusable_reason(received)
         self._refuse_first((why, f'not aligned with {sender.name}', why))
 
     # Relations between frames.
@@ -336,9 +336,9 @@ class Sharing:
         """
         Return the received vehicles that are not seen, in the ego frame, one state per vehicle.
 
-        A state keeps its stamp; its covariances are those of its prediction to ``now``. If several
-        states of one vehicle are known, the state with the least uncertainty is used, not their
-        mean, because their errors may be correlated.
+        A state keeps its stamp; its covariances are predicted to ``now``. If several states of one
+        vehicle are known, the state with the least uncertainty is used, not their mean, because
+        their errors may be correlated.
         """
         self._senders = {name: each for name, each in self.senders.items()
                          if now - each.received <= FORGOTTEN}
@@ -350,7 +350,7 @@ class Sharing:
             frame = sender.frame
             if frame is not None:
                 frame.drift(now, own.position)
-            if frame is None or sender.unusable(now):
+            if frame is None or sender.unusable_reason(now):
                 continue
             for name, state in sorted(sender.states.items()):
                 age, seen = (now - state.stamp) / NANOSECONDS, self._seen.get(name)
@@ -382,7 +382,8 @@ class Sharing:
             return 'no own odometry'
         if self._own.stamp - now > STALE_AGE:
             return OWN_FUTURE
-        active = {name: sender.unusable(now) for name, sender in sorted(self.senders.items())
+        active = {name: sender.unusable_reason(now)
+                  for name, sender in sorted(self.senders.items())
                   if now - sender.received <= to_nanoseconds(MESSAGE_AGE_MAX)}
         if not active:
             return 'no other sender'

@@ -48,7 +48,7 @@ class Sender:
     hops: float = math.inf
     """1 if its frame is related to the ego frame directly, 2 by one other sender, ..."""
     pairs: deque[Pair] = field(default_factory=lambda: deque(maxlen=MAX_PAIRS))
-    """Relations until the first fit."""
+    """Positions known in both frames, kept until the first fit."""
     yaw_std: float = math.pi
     """Standard deviation of the yaw of the sender's frame, rad, at the last fit."""
     related: dict[str, int] = field(default_factory=dict)
@@ -79,7 +79,7 @@ class Sender:
         place, yaw = self.frame.stds
         return not (place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX)  # NaN is vague
 
-    def unusable(self, now: int) -> str:
+    def unusable_reason(self, now: int) -> str:
         """Return why the sender's messages are not used at a time, ns, or ''."""
         if now < self.ban[0]:
             return self.ban[1]

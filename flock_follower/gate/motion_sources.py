@@ -125,7 +125,7 @@ class MotionSources:
 
     def _displacement_in_gap(self, yaw: float, time: float) -> Array | None:
         """
-        Return the displacement (3,), m, in a gap of odom by the autopilot, in the frame of odom.
+        Return the autopilot's displacement (3,), m, during a gap of odom, in the frame of odom.
 
         :param yaw: the newest by odom, rad; :param time: its time, s.
         :returns: None without a gap, or if the displacement or the turn of the frames is unknown.

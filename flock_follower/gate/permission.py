@@ -134,7 +134,7 @@ class Permission:
         """Return whether the vehicle, as far as known, obeys the setpoints."""
         return self.streams and self.obeyed
 
-    def taken_over(self, now: float) -> str:
+    def takeover_refusal(self, now: float) -> str:
         """Return the refusal if a pilot took over shortly before ``now``, s, or ''."""
         taken = self.phase is Phase.TAKEN_OVER or self.taker == STICK
         if not taken or not self.taker.pilot or now - self.received >= TAKEOVER_TIME:

@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The supported autopilots as records: modes, take-off, frames, messages, rules."""
+"""
+The supported autopilots as records: modes, take-off, frames, messages, rules.
+
+Another autopilot is another record, its texts in ``status_texts``, and a file in config/.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +36,9 @@ AUTO: Final[str] = 'auto'
 MINIMUM_STREAM_RATE: Final[float] = 2.0
 #: An autopilot may fly the last setpoint for this long, s. ArduPilot's default is 3 s, in which it
 #: gained 8.5 m/s, at 2.5 m/s^2, and flew 36 m.
-LONGEST: Final[float] = 1.0
+MAX_STREAM_TIMEOUT: Final[float] = 1.0
 _TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if the bridge died; '
-                         f'set it to {LONGEST:g} s at most')
+                         f'set it to {MAX_STREAM_TIMEOUT:g} s at most')
 _NOT_FUSED: Final[str] = ': it does not fuse the odometry that is forwarded to it; '
 #: Bits of PX4's EKF2_EV_CTRL: horizontal position, and velocity.
 _FUSED_BITS: Final[int] = 1 | 4
@@ -238,7 +242,7 @@ PX4: Final[Dialect] = Dialect(
     velocity_flags=(mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, 0),
     gps_switch='EKF2_GPS_CTRL', origin_has_height=False, recommendations='px4.params',
     versions=((1, 14), (1, 18)), offboard_rules=(
-        Rule('COM_OF_LOSS_T', lambda value: value > LONGEST, _TOO_LONG),
+        Rule('COM_OF_LOSS_T', lambda value: value > MAX_STREAM_TIMEOUT, _TOO_LONG),
         Rule('COM_OBL_RC_ACT', lambda value: value in (6, 7),
              ': it would stop its motors in the air (6: terminate, 7: disarm) if the bridge died; '
              'set it to 5 (Hold), or 4 (Land) where odometry is forwarded'),
@@ -277,7 +281,7 @@ ARDUPILOT: Final[Dialect] = Dialect(
     gps_switch='',  # an origin of zeros makes its firmware panic
     origin_has_height=True, recommendations='ardupilot.parm',
     versions=((4, 6), (4, 7)), offboard_rules=(
-        Rule('GUID_TIMEOUT', lambda value: value > LONGEST, _TOO_LONG),
+        Rule('GUID_TIMEOUT', lambda value: value > MAX_STREAM_TIMEOUT, _TOO_LONG),
         Rule('VISO_TYPE', lambda value: value == 0, f'{_NOT_FUSED}set it to 1 (MAVLink)',
              forwarding=True),
         *(Rule(f'EK3_SRC1_{source}', lambda value: value != _EXTERNAL_NAVIGATION,

@@ -233,7 +233,7 @@ class ParameterCheck:
         return name in self.values and self._tries.get(name, 0) <= UNKNOWN_AFTER
 
     def _names(self, version: Version | None) -> list[str]:
-        """Return the names to read, those that are needed by rules first."""
+        """Return the names to read; those that rules need come first."""
         return list(dict.fromkeys((*self._needed, *(
             entry.name for entry in self._recommended if entry.applies(version)))))
 

@@ -208,7 +208,7 @@ class Requests:
         if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
         reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived_reason(now),
-                   gate.permission.taken_over(now),
+                   gate.permission.takeover_refusal(now),
                    gate.contradiction(now),
                    not_hovering(telemetry.vehicle_type, telemetry.vtol_state(now))]
         if gate.speed(now) is None:

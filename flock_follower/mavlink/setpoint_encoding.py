@@ -15,7 +15,8 @@
 """
 ``encode_setpoint`` makes SET_POSITION_TARGET_LOCAL_NED of a setpoint.
 
-The message has acceleration and yaw in MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter obey.
+The message has acceleration and yaw in MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter obey. This
+is the last check for NaN before the wire.
 """
 
 from __future__ import annotations

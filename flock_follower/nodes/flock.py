@@ -116,7 +116,7 @@ class SharingNode(FlockNode):
     def _senders(self, now: float) -> dict[str, str]:
         """Return the frame of every sender for /diagnostics."""
         current = self._now()
-        return {f'frame of {name}': each.unusable(current) or (
+        return {f'frame of {name}': each.unusable_reason(current) or (
             'known to {:.3f} m, {:.3f} rad'.format(*each.frame.stds) if each.frame else '')
             for name, each in self._sharing.senders.items()}
 

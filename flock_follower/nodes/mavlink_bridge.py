@@ -80,8 +80,8 @@ from flock_follower.parameters.spec import filled
 COMMANDS_QOS = best_effort(10)
 ODOM_RATE = 50.0  # Hz: at most 20 ms after the arrival; higher if it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
-UNNUMBERED = ('this middleware numbers no messages: that a second node commands shows on '
-              '/diagnostics, but does not brake')
+UNNUMBERED = ('this middleware does not number messages: a second node that commands is reported '
+              'on /diagnostics, but causes no braking')
 TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
 ENDED = Outcome(False, 'refused: the setpoint thread has ended or takes no more')

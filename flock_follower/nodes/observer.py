@@ -41,7 +41,7 @@ from flock_follower.checks.dead_segments import dead_segments
 from flock_follower.checks.observations import Machine, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load, LOAD_PERIOD, LoadMeter
 from flock_follower.checks.reach import find_reach, Reach
-from flock_follower.checks.single_camera import alone
+from flock_follower.checks.single_camera import select_camera
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.neighbors_file import NeighborConfig
@@ -53,7 +53,7 @@ from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS
 from flock_follower.nodes.support.shared_memory import shared_memory_size
 from flock_follower.odometry.reader import read_odometry
-from flock_follower.parameters.spec import NAMES
+from flock_follower.parameters.spec import CAMERAS
 from flock_follower.perception.markers import load
 from flock_follower.pose_messages import POSE_TYPES
 from flock_follower.topic_names import (
@@ -195,9 +195,9 @@ class Observer(Node):
                 self.seen.names[ours] = topic
 
     def _take_values(self, node: str, values: dict[str, Any]) -> None:
-        """Keep the parameters of a node; of several cameras those of the one to observe."""
-        if NAMES in values:
-            camera, values = alone(values, self._camera)
+        """Keep the parameters of a node; with several cameras, those of the observed camera."""
+        if CAMERAS in values:
+            camera, values = select_camera(values, self._camera)
             topics = topics_of_camera(camera.image, camera.camera_info) if camera.name else {}
             self.seen.names.update({
                 ours: full_name(topic, self.seen.namespace)
@@ -267,7 +267,7 @@ def _machine(load: Load | None) -> Machine:
 
 
 def _find_reach() -> list[tuple[str, Reach | None]]:
-    """Return from where our nodes on this computer are reached; if it sees none, ``check``."""
+    """Return which computers reach our nodes here, or ``check`` if none of our nodes is seen."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     ours = [(node, process) for process, node, environment in find_processes()
             if environment.get('ROS_DOMAIN_ID', '0') == domain]

@@ -66,7 +66,7 @@ from flock_follower.nodes.support.runtime import deserialize, FlockNode, READERS
 from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.cameras import cameras, CameraValues
-from flock_follower.parameters.spec import filled, NAMES
+from flock_follower.parameters.spec import CAMERAS, filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import compute_in_one_thread, decode_image
 from flock_follower.perception.tracker import camera_mounting
@@ -183,7 +183,7 @@ class View(FlockNode):
                 each.callback(received[0])
 
     def _on_wake(self) -> None:
-        """Run the turn at once, after a page was opened or closed, or a button was pressed."""
+        """Run one cycle at once, after a page was opened or closed, or a button was pressed."""
         try:
             self._turn()
         except Exception as error:
@@ -237,7 +237,7 @@ class View(FlockNode):
         self._timer.reset()
 
     def _names(self) -> dict[str, str]:
-        """Return the names of our topics as relative_pose has them, ours without it."""
+        """Return the names of the topics of relative_pose; our default names without this node."""
         names = {'odom': 'odom', 'camera_info': self._camera.camera_info,
                  RAW_IMAGES: self._camera.images(self._transport),
                  'compressed': 'yes' if self._transport == 'compressed' else ''}
@@ -256,7 +256,7 @@ class View(FlockNode):
     def _take_parameters(self, values: dict[str, Any]) -> None:
         """Take the parameters of relative_pose; begin anew with them."""
         try:
-            known = values.get(NAMES) is not None
+            known = values.get(CAMERAS) is not None
             self._configure(cameras(values)[0] if known else CameraValues(''),
                             values.get('image_transport', 'raw'),
                             filled(SourceParams(), values, 'odom_'))

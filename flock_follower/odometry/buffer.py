@@ -306,9 +306,9 @@ class OdometryBuffer:
 
         The noise of the velocities (n, 3) is updated on the way.
 
-        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbors as far
-        apart as first and last. If angular velocities are missing or late, the latter are
-        farther apart, and more so than averaging would gain.
+        ``apart`` holds attitudes (n, 3), rad, newest first, propagated to one stamp. By noise
+        alone the first and the last differ as much as neighbors do. If angular velocities are
+        missing or late, the first and the last differ more: then averaging would lose.
         """
         self._comparisons += 1
         if self._comparisons > self.COMPARISONS and self._comparisons % 3:  # it changes slowly

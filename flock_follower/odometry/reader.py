@@ -155,7 +155,7 @@ class OdometrySource:
         self._restart()
 
     def _place(self, child: str) -> None:
-        """Place another child frame by the static frames; one that they lack is base_link."""
+        """Find another child frame in the static frames; an unknown frame is base_link."""
         if child != self._placed and (
                 (pose := self._static.pose_on_base(child)) is not None or self._placed):
             self.place_child(pose or Transform())
@@ -263,7 +263,7 @@ class OdometrySource:
         return True
 
     def _derived_rates(self) -> Array:
-        """Return the angular velocity (3,), rad/s, by the attitudes: those not yet taken in."""
+        """Return the angular velocity (3,), rad/s, from all attitudes so far."""
         for time, quaternion in self._attitudes:
             self.turning.take(time, quaternion)
         self._attitudes.clear()

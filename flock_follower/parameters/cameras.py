@@ -27,7 +27,7 @@ from itertools import combinations
 import math
 from typing import Any, Final, NamedTuple
 
-from flock_follower.parameters.spec import CAMERA_NAMES, NAMES, Spec
+from flock_follower.parameters.spec import CAMERA_NAMES, CAMERAS, Spec
 from flock_follower.ranges import check_topic, MAX_OFFSET, Range
 
 #: Default position of a camera on the body, m: in front of the middle of the vehicle.
@@ -89,7 +89,7 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     :raises ValueError: if a name of a topic is invalid, if two cameras share a name or a topic, or
         if a parameter of a single camera is set although there are several cameras.
     """
-    names = [name for name in values[NAMES] if name]
+    names = [name for name in values[CAMERAS] if name]
     if not names:
         return [CameraValues('', **{key: values[name] for name, (key, _) in ALONE.items()
                                     if name in values})]

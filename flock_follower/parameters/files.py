@@ -36,8 +36,8 @@ from flock_follower.parameters.sections import (
     read_sections,
 )
 from flock_follower.parameters.spec import (
+    CAMERAS,
     check_values,
-    NAMES,
     refuse_unknown,
     Spec,
     specs_of,
@@ -45,7 +45,7 @@ from flock_follower.parameters.spec import (
 
 Table = Mapping[str, Sequence[Spec]]
 #: Parameters that must be the same in all nodes: the cameras, and the reading of the odometry.
-COMMON = (NAMES, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
+COMMON = (CAMERAS, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
 
 #: The file beside a recording that holds the parameters that were flown with.
 FLOWN = 'parameters.yaml'

@@ -30,15 +30,15 @@ from typing import Any, TypeVar
 
 from flock_follower.ranges import Checked, Range, suggestion
 
-#: The parameter that lists the names of cameras. Each has a parameter of its own wherever EACH
-#: stands in the name of one; in its default that is the camera's name, too.
-NAMES, EACH = 'cameras', 'NAME'
+#: The parameter that lists the names of cameras. A parameter with the word EACH in its name exists
+#: once for each camera: the camera's name replaces the word, also in the default.
+CAMERAS, EACH = 'cameras', 'NAME'
 #: Parameters that every ROS node has.
 OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
 #: Parameters of earlier versions, and the reason or the replacement.
 REMOVED = {
     'altitude_hold': 'it is now altitude_mode: hold for true, or follow',
-    'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
+    'setpoint_mode': 'setpoints have acceleration and yaw, which both autopilots obey',
     'j_max': 'the jerk of setpoints is not limited: remove the line',
     'check_parameters': 'they are always compared: remove the line',
     'range_max': 'the bridge bounds the distance: set radius_max of mavlink_bridge',
@@ -136,7 +136,7 @@ class Spec:
 
 
 CAMERA_NAMES = Spec(
-    NAMES, [''],
+    CAMERAS, [''],
     'names of several cameras, each with parameters camera.NAME...; empty: a single camera, with '
     'camera_rpy')
 
@@ -214,12 +214,12 @@ def expanded_names(names: Iterable[str], values: Mapping[str, Any]) -> set[str]:
 
 def _listed_cameras(values: Mapping[str, Any]) -> list[str]:
     """Return the names of several cameras, [] of one; ValueError if the list is wrong."""
-    value: Any = CAMERA_NAMES.check(values.get(NAMES, CAMERA_NAMES.default))
+    value: Any = CAMERA_NAMES.check(values.get(CAMERAS, CAMERA_NAMES.default))
     names = [name for name in value if name]
     for name in names:
         if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or names.count(name) > 1:
-            raise ValueError(f'{NAMES} = {value}: {name!r} must be a letter, then letters, digits '
-                             'and _, different from the others')
+            raise ValueError(f'{CAMERAS} = {value}: {name!r} must be a letter, then letters, '
+                             'digits and _, different from the others')
     return names
 
 

@@ -29,6 +29,8 @@ With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (
 - equidistant (fisheye), D = (k1, k2, k3, k4): t = atan r,
   (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
 
+Another lens also needs ``planner.sight`` (field of view) and ``flock_desk.camera.lens``.
+
 The models are implemented here, not taken from cv2: cv2's undistortion stops before it has
 converged, its option for accuracy differs between OpenCV 4 and 5, and the Jacobians of its fisheye
 functions have another order.

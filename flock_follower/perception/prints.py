@@ -16,8 +16,8 @@
 Whether a marker in an image is the print in the neighbors file: its border, its orientation.
 
 The fit of the pose does not detect the two faults. A print with a border of two cells (Kalibr's)
-is fitted at a wrong distance. A print that is rotated by a quarter or half turn gives a body that
-is tilted by this angle, and a position of the body that is wrong by its distance from the marker.
+is fitted at a wrong distance. If a print is rotated by a quarter or half turn, the body appears
+tilted by this angle, and its position is wrong by up to twice its distance from the marker.
 """
 
 from __future__ import annotations

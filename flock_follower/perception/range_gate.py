@@ -44,7 +44,7 @@ class RangeGate:
     """
     The gate of a series of distances.
 
-    :param most: of so many too long distances in a row the last one is used.
+    :param most: number of consecutive too long distances of which the last one is used.
     """
 
     def __init__(self, most: int = 6) -> None:

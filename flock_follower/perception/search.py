@@ -212,14 +212,14 @@ def _from_square(outlines: Array) -> Array:
 
 
 def _local(brightness: Array) -> Array:
-    """Return the difference of each cell of squares (n, c) from its surroundings, of norm 1."""
+    """Return squares (n, c) with each cell minus the mean around it, each row of norm 1."""
     differs = brightness.astype(float).dot(_differences(math.isqrt(brightness.shape[1])))
     return differs / np.maximum(np.linalg.norm(differs, axis=1, keepdims=True), 1e-6)
 
 
 @lru_cache(maxsize=16)
 def _differences(side: int) -> Array:
-    """Return the symmetric matrix from square cells to their differences from those around."""
+    """Return the matrix that subtracts from each cell the mean of the 3 x 3 cells around it."""
     cells = np.eye(side * side).reshape(-1, side, side)
     return np.array([(cell - cv2.blur(cell, (3, 3))).ravel() for cell in cells])
 
@@ -255,8 +255,9 @@ def _squares(outlines: list[Array], max_hidden: Array) -> Array:
     """
     Return the quadrilaterals that convex outlines may be the visible parts of, (n, 4, 2).
 
-    One side of five is where a reflex ends. Before, sides that hide next to nothing are removed,
-    and of more than five those that hide least, of equals the one that hides most to the left.
+    Of more than five sides the one that hides least is removed (of equals, the one whose new
+    corner is farthest left), until five are left. Of five, a side that hides next to nothing is
+    removed; without such a side, any of the five may be the end of a reflex.
 
     :param outlines: corners (4 to _MAX_CORNERS, 2) of each, clockwise.
     :param max_hidden: the largest area that may be hidden of each, px^2.

@@ -128,7 +128,7 @@ smear_model = lru_cache(maxsize=64)(SmearModel)
 
 
 def _with_slopes(level: Array) -> Any:
-    """Return how white a print is, and by how much more per cell to the right and down."""
+    """Return the whiteness of a print, and its increase per cell to the right and down."""
     down, right = np.gradient(level)
     return np.dstack([level, _TEXELS_PER_CELL * right, _TEXELS_PER_CELL * down]).astype(np.float32)
 

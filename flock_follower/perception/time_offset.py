@@ -161,7 +161,7 @@ def fit_offset(misfits: Array, freedom: float) -> tuple[float, float]:
     """
     Return the most likely offset, s, relative to the initial one, and its standard deviation.
 
-    :param misfits: of each offset of OFFSET_GRID, in any unit; the least is the misfit by noise.
+    :param misfits: one for each offset of OFFSET_GRID, in any unit; the least one is due to noise.
     :param freedom: number of measured values minus number of fitted values.
     """
     chi2 = misfits * (freedom / misfits.min()) + (OFFSET_GRID / INITIAL_DEVIATION)**2

@@ -36,10 +36,11 @@ Behind another follower a headway T_h grows the near edge with the ego speed -n 
 
     g_near = r - sqrt(d0) - m - T_h (v_max - n . v_F)
 
-dg_near/dt = s + T_h (n . a + w_t . v_F / r) then has the ego acceleration in it: with A the right
-side above, n . a >= (A - S'(g_near) T_h w_t . v_F / r) / (1 + S'(g_near) T_h). At the edge the
-velocity of the follower is that of the one ahead through (1 + tau z) / (1 + (tau + T_h) z), z the
-Laplace variable: without delays no motion of a column grows from one follower to the next.
+Then dg_near/dt = s + T_h (n . a + w_t . v_F / r) contains the ego acceleration a. With A the right
+side of the first inequality above, the bound becomes n . a >= (A - S'(g_near) T_h w_t . v_F / r) /
+(1 + S'(g_near) T_h). At the edge the transfer function from the velocity of the vehicle ahead to
+the follower's is (1 + tau z) / (1 + (tau + T_h) z), z the Laplace variable: without delays no
+motion of a column grows from one follower to the next.
 
 The air below and above another vehicle is disturbed, so there is a separate bound on the
 horizontal distance. The height of a neighbor out of sight is unknown: only its horizontal distance

@@ -172,10 +172,10 @@ def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tu
 
 def nearest_in_order(goal: complex, sides: Sequence[Side], discs: Discs) -> complex:
     """
-    Return the point of the discs nearest to ``goal`` within the bounds, in order of priority.
+    Return the point of the discs that meets the bounds and is nearest to ``goal``.
 
-    If the bounds before leave no room for a bound, it is met as nearly as they permit: no bound
-    relaxes a bound before it. A bound whose normal is zero is ignored.
+    The bounds are in order of priority: if the earlier ones leave no room for a bound, it is met
+    as nearly as they permit. A bound whose normal is zero is ignored.
     """
     sides = [(normal, min(max(least, -_HUGE), _HUGE)) for normal, least in sides if normal]
     point, k = optimum(goal, False, sides, discs)

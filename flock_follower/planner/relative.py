@@ -21,9 +21,9 @@ no drift. Only these two are used. The speed over the ground is neither known no
 
 A relative velocity, which is limited, and reached with the time constant VELOCITY_TIME, leads the
 follower to the middle of the law's band. So all relative motion is damped; the common motion is
-that of the leader (relative data cannot damp more: SWA, arXiv 2508.16460). An observer offsets the
-relative acceleration that was not commanded: that by the tilt error of the follower, and that of
-the leader. Other neighbors in sight limit the approach.
+that of the leader (relative data cannot damp more: SWA, arXiv 2508.16460). An observer compensates
+the relative acceleration that was not commanded: by the follower's tilt error, and by the leader's
+motion. Other neighbors in sight limit the approach.
 """
 
 from __future__ import annotations

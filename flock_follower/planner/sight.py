@@ -15,6 +15,8 @@
 """
 Field of view of the cameras, and occlusion of the faced neighbor: its marker should be visible.
 
+A lens is a pinhole or an equidistant fisheye here, without distortion (``FieldOfView.of_camera``).
+
 If a marker leaves the image, it is expected to come back, and the follower coasts. If a marker is
 predicted well inside the image and is not found, an obstacle in the follower's way covers it, and
 the follower brakes. No function reads a clock.
@@ -50,7 +52,8 @@ class FieldOfView(NamedTuple):
     up: float
     down: float
     heading: float = 0.0
-    """Anticlockwise angle of its axis, if it is one of several, rad; the others count from it."""
+    """Anticlockwise angle of the camera's axis, rad, if there are several cameras; the other
+    angles count from it."""
 
     @classmethod
     def of_camera(cls, info: Any, rpy: ArrayLike, several: bool = False,

@@ -85,7 +85,7 @@ class Altitude(NamedTuple):
         return cls(z, min(low, z), max(high, z), ground=ground, limits=limits)
 
     def after_jump(self, z: float, jump: float) -> Altitude:
-        """Return it in a frame of odometry that is higher by ``jump``, m; it holds ``z``, m."""
+        """Return this altitude, now ``z``, m, in an odometry frame higher by ``jump``, m."""
         return Altitude(z, min(self.lowest + jump, z), max(self.highest + jump, z),
                         ground=None if self.ground is None else self.ground + jump,
                         limits=self.limits)
@@ -228,7 +228,7 @@ def search_yaw(last: float, me: OwnState, there: Neighbor, since: float, params:
 def turn_rate(before: float, commanded: float, me: OwnState, params: PlannerParams,
               elapsed: float) -> float:
     """
-    Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
+    Return the yaw rate, rad/s, anticlockwise, that follows the commanded yaw.
 
     The rate is that of the commanded yaw, plus a correction towards this yaw, because an autopilot
     that receives a rate does not control the yaw itself.

@@ -330,7 +330,7 @@ async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
 
 
 def _end(connection: Any) -> None:
-    """End a connection at once: what it leaves unread would keep it open."""
+    """End a connection at once: unread data would keep it open."""
     if connection.transport is not None:  # else it has ended
         connection.transport.abort()
 

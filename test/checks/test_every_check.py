@@ -442,7 +442,7 @@ FAULTS: list[Fault] = [
     Fault('images of which few have no stamp', BOTH, WARNING, 'images latency', 'have no stamp',
           'stamp each message', unstamped(30)),
     Fault('images of two clocks', BOTH, ERROR, 'images latency', 'older than the message before',
-          'take one', stamped_as(lambda n: n - 12 * (n > 12 and n % 2))),
+          'keep one', stamped_as(lambda n: n - 12 * (n > 12 and n % 2))),
     Fault('images that stop', LIVE, ERROR, 'images', 'stopped: none in the last 3', 'is it still',
           kept('image_raw', slice(60))),
     Fault('images above the shared memory', LIVE, WARNING, 'shared memory',

@@ -147,8 +147,8 @@ def test_both_count_from_where_the_follower_was_first_heard_of(two):
 
 @pytest.mark.parametrize(('silent', 'received', 'reported'), [
     (0, True, '^truth_connection = .*PX4 is connected, but sends no HIL_STATE_QUATERNION; its own '
-              'estimate will not do where two vehicles are flown elsewhere'),
-    (1, True, '^leader_truth_connection = .*its own estimate will not do'),
+              'estimate is not sufficient: two vehicles are flown elsewhere'),
+    (1, True, '^leader_truth_connection = .*its own estimate is not sufficient'),
     (1, False, '^leader_truth_connection = .*no pose of a vehicle within 1 s: nothing arrives$')])
 def test_of_two_vehicles_both_have_to_tell_the_truth(silent, received, reported, two):
     vehicles = ExternalVehicles(two[0].link, two[1].link)

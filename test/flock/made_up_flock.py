@@ -248,7 +248,7 @@ class MadeUpFlock:
             record.ticks += 1
         for j, other in enumerate(self.names[1:], 1):
             sender = self.sharing[name].senders.get(other)
-            if sender is not None and sender.frame is not None and not sender.unusable(
+            if sender is not None and sender.frame is not None and not sender.unusable_reason(
                     self.stamp(self.time, name)):
                 self.nees.append(self.misfit(k, j, sender.frame))
 

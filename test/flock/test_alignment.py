@@ -73,7 +73,7 @@ def test_yaw_of_hovering_ones_is_unknown_without_attitudes() -> None:
     flock = flown(Conditions('side by side', still=True), 12.0)
     assert flock.received == {}
     sender = flock.sharing['follower_1'].senders['follower_2']
-    assert 'a vehicle must move' in sender.unusable(flock.stamp(flock.time, ''))
+    assert 'a vehicle must move' in sender.unusable_reason(flock.stamp(flock.time, ''))
     assert flock.events['not aligned with follower_2'] > 90
     seeing = flown(Conditions('side by side', still=True, attitude_std=0.03), 5.0)
     assert set(seeing.received) == {('follower_1', 'follower_2'), ('follower_2', 'follower_1')}
@@ -121,7 +121,7 @@ def test_a_clock_that_is_ahead_is_refused_and_one_behind_is_told() -> None:
     assert flock.events['message from the future'] > 50
     senders = flock.sharing['follower_1'].senders
     assert 'clock is behind' in senders['follower_3'].slow and senders['follower_4'].slow == ''
-    assert senders['follower_2'].unusable(
+    assert senders['follower_2'].unusable_reason(
         flock.stamp(flock.time, '')) == 'has a clock that is ahead'
 
 

@@ -158,7 +158,7 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
         near.take_own(own(now))
         apart.take_message(state(stamp=now, position=(8 * (k % 2), 0, 1)), now)
         near.take_message(state(stamp=now, position=(0.1 * (k % 2), 0, 1)), now)
-    assert near.senders['f2'].unusable(now) == 'sends 20 times in 1.4 s'
+    assert near.senders['f2'].unusable_reason(now) == 'sends 20 times in 1.4 s'
     assert 'ignored for a while' in reasons(near)
     assert reasons(apart).count('aligned anew with f2') > 10
 
@@ -166,7 +166,8 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
 @pytest.mark.parametrize(('variance', 'usable'), [(1e-3, True), (0.1, False), (math.nan, False)])
 def test_a_frame_is_used_if_it_is_known_well_enough(variance: float, usable: bool) -> None:
     frame = Frame(0.0, np.zeros(3), np.zeros(3), variance * np.eye(4), EPOCH)
-    assert Sender('f2', frame=frame).unusable(EPOCH).startswith('its frame is known') != usable
+    reason = Sender('f2', frame=frame).unusable_reason(EPOCH)
+    assert reason.startswith('its frame is known') != usable
 
 
 def test_why_nothing_is_heard_is_told() -> None:

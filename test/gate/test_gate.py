@@ -330,4 +330,4 @@ def test_a_silence_without_the_mode_hides_no_takeover():
     gate = fresh_gate()
     assert decide(gate, 13.2, link_age=3.2, mode_age=3.2).kind == 'none'
     gate.take_status(NOT_FLOWN, 14.0)
-    assert gate.permission.taken_over(23.9)
+    assert gate.permission.takeover_refusal(23.9)

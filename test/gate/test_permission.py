@@ -95,17 +95,18 @@ def test_a_landing_ends_the_permission(events):
 def test_a_takeover_bars_offboard_for_ten_seconds():
     permission = after(ASKED, seen(OURS), seen(PILOT, 5.0))
     for now, seconds in ((4.0, 0), (5.0, 0), (11.0, 6)):
-        assert permission.taken_over(now).startswith(
+        assert permission.takeover_refusal(now).startswith(
             f'the pilot, or a failsafe, took over {seconds} s ago')
-        assert permission.name_taker(STICK, now).taken_over(now).startswith('the pilot took over')
-        assert not permission.name_taker(STICK, now).taken_over(15.0)  # 10 s from the takeover
-    assert permission.taken_over(14.9)
+        by_stick = permission.name_taker(STICK, now)
+        assert by_stick.takeover_refusal(now).startswith('the pilot took over')
+        assert not by_stick.takeover_refusal(15.0)  # 10 s from the takeover
+    assert permission.takeover_refusal(14.9)
     failed = permission.name_taker(takeover.failsafe('fence'), 6.0)
-    assert not failed.taken_over(6.0)
+    assert not failed.takeover_refusal(6.0)
     assert failed.announcement() == 'TAKEN_OVER: offboard was left for POSCTL: failsafe: fence'
-    assert failed.name_taker(takeover.PILOT, 16.0).taken_over(25.9)  # a later pilot
-    assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
-    assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
+    assert failed.name_taker(takeover.PILOT, 16.0).takeover_refusal(25.9)  # a later pilot
+    assert not permission.takeover_refusal(15.0) and not permission.takeover_refusal(60.0)
+    assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).takeover_refusal(5.0)  # our own
 
 
 @pytest.mark.parametrize('later', [OURS, HOLD])
@@ -129,9 +130,9 @@ def test_a_stick_takes_over_no_flight_that_none_took(events):
     (ENDED, ('fall_silent', 'no velocity')), (LANDED,), (seen(DISARMED, 5.0),)])
 def test_nothing_but_a_request_undoes_a_moved_stick(events):
     permission = after(ASKED, seen(OURS, 5.0), MOVED, *events)
-    assert permission.taken_over(14.9).startswith('the pilot took over')
-    assert not permission.taken_over(15.0)
-    assert not next_permission(permission, ('request', 15.0)).taken_over(15.0)
+    assert permission.takeover_refusal(14.9).startswith('the pilot took over')
+    assert not permission.takeover_refusal(15.0)
+    assert not next_permission(permission, ('request', 15.0)).takeover_refusal(15.0)
 
 
 @pytest.mark.parametrize('ended', [
@@ -139,8 +140,8 @@ def test_nothing_but_a_request_undoes_a_moved_stick(events):
 def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
     permission = after(ASKED, seen(OURS, 5.0), *ended, MOVED)
     assert permission.phase is Phase.INACTIVE
-    assert permission.taken_over(14.9).startswith('the pilot took over')
-    assert not permission.taken_over(15.0) and after(MOVED) == Permission()
+    assert permission.takeover_refusal(14.9).startswith('the pilot took over')
+    assert not permission.takeover_refusal(15.0) and after(MOVED) == Permission()
 
 
 UNSEEN = ('fall_silent', 'no velocity', 3.1)  # without a mode for so long, s
@@ -153,9 +154,9 @@ def test_silence_hides_no_switch_that_was_not_seen(events):
     assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
     assert next_permission(silent, seen(OURS, 20.0)).phase is Phase.INACTIVE
     switched = after(ASKED, seen(OURS), *events, seen(OURS, 20.0), seen(PILOT, 21.0))
-    assert switched.phase is Phase.TAKEN_OVER and switched.taken_over(30.9)
+    assert switched.phase is Phase.TAKEN_OVER and switched.takeover_refusal(30.9)
     landed = next_permission(silent, seen(DISARMED, 20.0))
-    assert not landed.taken_over(20.0)
+    assert not landed.takeover_refusal(20.0)
     assert next_permission(landed, seen(PILOT, 21.0)) is landed
     # Nothing is hidden if the mode was known, or had not been there yet.
     for known in (after(ASKED, seen(OURS), ('fall_silent', 'no velocity', 3.0)),
@@ -166,7 +167,7 @@ def test_silence_hides_no_switch_that_was_not_seen(events):
 def test_a_request_hides_no_possible_takeover_by_the_pilot():
     lost = after(ASKED, seen(OURS), ('follow_silence', 5.1), ENDED)
     assert lost.announcement() == 'READY: giving back: hold requested'
-    assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
+    assert next_permission(lost, seen(PILOT, 20.0)).takeover_refusal(20.0)
 
 
 def test_a_second_end_of_a_flight_is_no_possible_takeover():
@@ -242,7 +243,7 @@ def test_long_silence_may_hide_a_takeover_and_return():
     assert active.follow_silence(LONGEST_SILENCE) is active
     assert active.follow_silence(LONGEST_SILENCE + 0.1).announcement() == lost.announcement()
     # Somebody has changed the mode meanwhile; a disarmed vehicle was landed.
-    assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
+    assert next_permission(lost, seen(PILOT, 20.0)).takeover_refusal(20.0)
     assert next_permission(lost, seen(DISARMED, 20.0)).phase is Phase.INACTIVE
     assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS, 2.0), seen(OURS, 20.0)).phase is Phase.GIVING_BACK

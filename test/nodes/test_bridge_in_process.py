@@ -218,7 +218,7 @@ def test_limits_only_fall_in_flight_second_commander_brakes(make_bench):
     bench.wait(lambda: not bench.node._flying())
     reason = bench.bridge.gate.permission.reason
     assert reason == 'two nodes command:  on /command/trajectory' and reason in bench.problems()
-    assert sum('numbers no messages' in text for text in bench.log) == 1
+    assert sum('does not number messages' in text for text in bench.log) == 1
     # What ended the flight can be decided again.
     begin = 'situation of the last decision: '
     bench.wait(lambda: any(text.startswith(begin) for text in bench.log))

@@ -65,7 +65,11 @@ def decide(now: float, *neighbors: Neighbor, me: OwnState | None = None,
 
 
 def tracking(now: float = 0.0, params: PlannerParams = PARAMS, **state: Any) -> Memory:
-    """Return the memory of a planner that has just followed the leader."""
+    """
+    Return the memory of a planner that has just followed the leader.
+
+    An estimate 1 m away from this one in the next step is refused as a jump.
+    """
     memory, decision = step(Memory(), now, True, own(now), [leader(now, **state)], params)
     assert decision.state is State.TRACK
     return memory

@@ -139,7 +139,7 @@ class BridgeProblems:
             'distance_from_start_m': 'unknown' if place.offset is None else (
                 f'{math.hypot(*place.offset.tolist()):.2f}'),
             'displacement_check': (
-                'height only: the autopilot fuses the odometry, which proves nothing'
+                'height only: the autopilot fuses the odometry, and cannot confirm it'
                 if gate.autopilot.fused else 'odometry against the autopilot, and height')}
 
     def _link_values(self, now: float) -> dict[str, object]:

@@ -234,7 +234,7 @@ def _changes_frame(before: OdometryState, after: OdometryState) -> bool:
     """
     Return whether odometry has another frame than before, by ODOMETRY_JUMP.
 
-    The bridge takes each message, and one out of order is no other frame.
+    A message that is slightly out of order does not count as another frame.
     """
     elapsed = (after.stamp - before.stamp) / NANOSECONDS
     return after.frame != before.frame or elapsed < -FUTURE_TOLERANCE or (

@@ -198,7 +198,8 @@ class Diagnostics:
         else:
             logger.warning(message)
 
-    def _asked(self, function: Callable[[float], Any], now: float) -> Any:
+    def _call(self, function: Callable[[float], Any], now: float) -> Any:
+        """Return the result of a check or a source; report its exception, and return None."""
         try:
             return function(now)
         except Exception as error:
@@ -207,7 +208,7 @@ class Diagnostics:
 
     def problems(self, now: float) -> list[Problem]:
         """Return every current problem, the worst first."""
-        found = [self._asked(check, now) for check in self.checks]
+        found = [self._call(check, now) for check in self.checks]
         found += [(ERROR, message) for last, message in self._internal.values()
                   if now - last < ERROR_SHOWN]
         return sorted(filter(None, found), key=lambda problem: problem[0], reverse=True)
@@ -216,7 +217,7 @@ class Diagnostics:
         """Return all values at a monotonic time, s."""
         values = dict(self.values)
         for source in self.sources:
-            values |= self._asked(source, now) or {}
+            values |= self._call(source, now) or {}
         for name, durations in self.latencies.items():
             values |= percentiles(name, durations)
         values |= {name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}
