@@ -113,11 +113,11 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
 def test_ten_seconds_count_from_last_switch_of_pilot(later):
     """LOITER, GUIDED, LOITER: offboard was accepted 1 s after the last switch."""
     permission = after(ASKED, seen(OURS), seen(PILOT, 5.0), seen(later, 9.0), seen(PILOT, 14.0))
-    assert permission.taken_over(23.9) and not permission.taken_over(24.0)
+    assert permission.takeover_refusal(23.9) and not permission.takeover_refusal(24.0)
     assert permission.announcement().startswith('TAKEN_OVER: offboard was left for POSCTL: ')
-    assert after(ASKED, seen(OURS), seen(PILOT, 5.0), seen(PILOT, 14.0)).taken_over(15.0) == ''
+    assert after(ASKED, seen(OURS), seen(PILOT, 5.0), seen(PILOT, 14.0)).takeover_refusal(15.0) == ''
     failed = after(ASKED, seen(OURS), seen(PILOT, 5.0)).name_taker(takeover.failsafe('fence'), 6.0)
-    assert not next_permission(failed, seen(HOLD, 7.0)).taken_over(7.0)  # it may fly several modes
+    assert not next_permission(failed, seen(HOLD, 7.0)).takeover_refusal(7.0)  # it may fly several modes
 
 
 @pytest.mark.parametrize('events', [(), (ASKED,), (ASKED, seen(OURS)), (ASKED, LANDED)])
