@@ -270,7 +270,7 @@ class HeightEstimator:
         return (self._reported or 0.0) + self._slow.error
 
     def correct(self, climb_rate: float, now: float) -> float:
-        """Return a vertical velocity of odometry, m/s, corrected by at most MAX_CORRECTION."""
+        """Return a vertical velocity of odometry, m/s, corrected: beyond its steps by a limit."""
         known = self._reported is not None and now - self._time <= HEIGHT_TIMEOUT
         rest = self._slow.error - self._proven
         error = self._proven + min(max(rest, -MAX_CORRECTION), MAX_CORRECTION)
