@@ -112,7 +112,6 @@ def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], e
     :param velocity: ego velocity (3,), m/s; used only with a headway.
     """
     (x, y, z), w, a = offset, relative_velocity, neighbor_acceleration
-    near, far, margin, spread, spreading, headway, fastest = edges
     distance = math.hypot(x, y, z)
     if not (SHORTEST < distance < SANE and math.hypot(*w, *a) < SANE):
         return []  # as for NaN, which fails every comparison
@@ -120,17 +119,18 @@ def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], e
     rate = scalar_product(n, w)
     common = scalar_product(n, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
     # The growing sphere of possible places approaches at its growth rate.
-    closing = rate - spreading
+    closing = rate - edges.spreading
     away = scalar_product(n, velocity)
-    gap = distance - near - margin - spread - headway * max(fastest - away, 0.0)
+    gap = distance - edges.near - edges.margin - edges.spread - edges.headway * max(
+        edges.fastest - away, 0.0)
     speed, slope = params.closing_speed(gap)
     lowest = common - (closing + speed) / params.T_g - slope * closing
-    if headway > 0.0:
+    if edges.headway > 0.0:
         turned = (scalar_product(w, velocity) - rate * away) / distance
-        lowest = (lowest - slope * headway * turned) / (1.0 + slope * headway)
+        lowest = (lowest - slope * edges.headway * turned) / (1.0 + slope * edges.headway)
     bounds = [Bound(n, lowest, SEPARATION, distance, seen)]
-    if math.isfinite(far):
-        speed, slope = params.closing_speed(far - margin - distance)
+    if math.isfinite(edges.far):
+        speed, slope = params.closing_speed(edges.far - edges.margin - distance)
         highest = common - (rate - speed) / params.T_g - slope * rate
         bounds.append(Bound(opposite(n), -highest, COHESION, distance, seen))
     return bounds

@@ -233,4 +233,3 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     if done >= 1.0 - 1e-9:
         return law, None
     return command + max(done, 0.0) * (limit_norm(law, params.a_max) - command), fading
-
