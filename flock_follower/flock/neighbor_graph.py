@@ -53,11 +53,12 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     :param own_radius: of this vehicle, m.
     :param held: (m,) whether a neighbor shared an edge in the step before.
     """
-    own = np.maximum(_lengths(positions - position) - radii, 0.0)
+    x = np.ascontiguousarray(positions.T)
+    own = np.maximum(_lengths(x - position[:, None]) - radii, 0.0)
     between = radii[:, None] + radii - 2.0 * own_radius
-    others = np.maximum(_lengths(positions[:, None] - positions) - between, 0.0)
-    np.fill_diagonal(others, math.inf)
-    nearer = np.maximum(own[:, None], others).min(axis=0)  # of all, to the farther end
+    others = np.maximum(_lengths(x[:, :, None] - x[:, None]) - between, 0.0)
+    others.flat[::len(own) + 1] = math.inf
+    nearer = np.minimum.reduce(np.maximum(own[:, None], others))  # of all, to the farther end
     joined: NDArray[np.bool_] = own <= np.where(held, HELD_FACTOR, 1.0) * nearer
     return joined
 
@@ -79,20 +80,20 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     :param most: largest cohesion with one neighbor, m/s^2.
     """
     r2 = (offsets ** 2).sum(axis=1, keepdims=True)
-    flock = np.concatenate([np.zeros_like(differences[:1]), differences[~others]])
+    flock = np.concatenate([np.zeros((1, differences.shape[1])), differences[~others]])
     scale = np.where(others[:, None], pair_disagreement(differences), disagreement(flock))
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
     joined = share[:, None]
-    u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)
-                      - (1.0 - joined) * apart * fade(r2, params) * offsets, axis=0)
+    u: Array = (joined * (alignment(r2, params) * differences + pull * offsets)
+                - (1.0 - joined) * apart * fade(r2, params) * offsets).sum(axis=0)
     return u
 
 
 def fade(r2: Array, params: FlockingParams) -> Array:
     """Return psi at r2, m^2: 1 up to d0 + 0.28 (d1 - d0), then falling to 0 at d1."""
     begin = params.d0 + _FADE * (params.d1 - params.d0)
-    y = ((r2 - begin) / (params.d1 - begin)).clip(0.0, 1.0) - 0.5
+    y = np.minimum(np.maximum((r2 - begin) / (params.d1 - begin), 0.0), 1.0) - 0.5
     square, sine = y * y, np.full_like(y, _SINE[-1])
     for coefficient in _SINE[-2::-1]:
         sine *= square
@@ -102,9 +103,10 @@ def fade(r2: Array, params: FlockingParams) -> Array:
 
 def pair_disagreement(differences: Array) -> Array:
     """Return L, m/s, of each single pair of agents, from v_j - v_i (..., n)."""
-    return np.linalg.norm(differences, axis=-1, keepdims=True) / np.sqrt(2.0)
+    return np.sqrt((differences ** 2).sum(axis=-1, keepdims=True)) / math.sqrt(2.0)
 
 
 def _lengths(vectors: Array) -> Array:
-    lengths: Array = np.sqrt((vectors ** 2).sum(axis=-1))
+    """Return the lengths (...) of vectors (3, ...)."""
+    lengths: Array = np.sqrt((vectors ** 2).sum(axis=0))
     return lengths

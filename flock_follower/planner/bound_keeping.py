@@ -115,27 +115,28 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     :param required: the bounds, the most important first (see ``sort_bounds``).
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
-    speed = math.hypot(*v.tolist())
+    (vx, vy, vz), requested = v.tolist(), a.tolist()
+    speed = math.hypot(vx, vy, vz)
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST_OWN
     fastest = max(v_max, speed * INSIDE_SHARE) if flyable else v_max
-    requested = a.tolist()
     if not flyable or not all(map(math.isfinite, requested)) or all(
             scalar_product(each.normal, requested) >= each.least for each in required):
         return limit_command(a, v, a_max, fastest, period)
     # The bounds on which the horizontal part has an influence.
-    sides = [(complex(x, y), each.least - z * requested[2], each.reason)
-             for each in required for x, y, z in [each.normal]
+    ax, ay, vertical = requested
+    sides = [(complex(x, y), least - z * vertical, reason)
+             for (x, y, z), least, reason, _, _ in required
              if math.hypot(x, y) > MIN_HORIZONTAL_SHARE]
-    bounds = [side[:2] for side in sides]
-    missed = [product(normal, complex(*requested[:2])) < least for normal, least in bounds]
+    bounds = [(normal, least) for normal, least, _ in sides]
+    missed = [normal.real * ax + normal.imag * ay < least for normal, least in bounds]
     if not any(missed):
         return limit_command(a, v, a_max, fastest, period)
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
-    vertical, strongest = requested[2], a_max * SENT_INSIDE
-    left = float(v[2]) + vertical * period
-    within = complex(*(-v[:2] / period)), math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
-    goal = complex(*limit_norm(a, SANE)[:2])
+    strongest = a_max * SENT_INSIDE
+    left, center = vz + vertical * period, complex(-vx / period, -vy / period)
+    within = center, math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
+    goal = complex(*limit_norm(a, SANE)[:2].tolist())
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
     cohesion = [k for k, side in enumerate(sides) if side[2] == COHESION]
     if cohesion:

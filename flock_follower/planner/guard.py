@@ -264,7 +264,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Sequen
                   for it in places]
     # A follower in sight may go back at any time, as fast and as hard as the ego vehicle can.
     headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
-    found = list[Bound]()
+    found: list[Bound] = []
     for place in places:
         found += in_sight(place, me.position.tolist(), velocity, seen,
                           joined and place is places[-1], params, radii_sum, headway)

@@ -119,7 +119,8 @@ def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
         variance = xx + yy + zz
         if not 0.0 <= variance <= most ** 2:  # NaN is uncertain; some sources send -1 for unknown
             return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
-        if not all(abs(both) <= variance for both in (xy + yx, xz + zx, yz + zy)):
+        if not (abs(xy + yx) <= variance and abs(xz + zx) <= variance
+                and abs(yz + zy) <= variance):
             return Rejection('too uncertain', f'invalid covariance of its {name}')
     return None
 
@@ -197,7 +198,8 @@ def predict(n: Neighbor, acceleration: Sequence[float], age: float,
         size = math.hypot(*acceleration)
     share = (size / ACCELERATION_NOISE) ** 4
     significant = share / (1.0 + share)
-    a = [u * significant for u in acceleration]
+    (x, y, z), (vx, vy, vz) = n.position.tolist(), velocity
+    ax, ay, az = (u * significant for u in acceleration)
     known = min(max(age, 0.0), TRUSTED_TIME)
     gained, soon = known * (age - 0.5 * known), min(age + params.response_time, TRUSTED_TIME)
     blind, most = age - (params.heard_timeout if n.received else FRESH), (
@@ -205,7 +207,8 @@ def predict(n: Neighbor, acceleration: Sequence[float], age: float,
     speeding = min(blind, (params.leader_speed_max + math.hypot(*velocity)) / most) if (
         blind > 0.0 and most > 0.0) else 0.0
     return Prediction(
-        [x + age * v + gained * u for x, v, u in zip(n.position.tolist(), velocity, a)],
-        [v + soon * u for v, u in zip(velocity, a)], a if age < TRUSTED_TIME else [0.0, 0.0, 0.0],
+        [x + age * vx + gained * ax, y + age * vy + gained * ay, z + age * vz + gained * az],
+        [vx + soon * ax, vy + soon * ay, vz + soon * az],
+        [ax, ay, az] if age < TRUSTED_TIME else [0.0, 0.0, 0.0],
         most * speeding * (blind - 0.5 * speeding), most * speeding,
-        [v + TRUSTED_TIME * u for v, u in zip(velocity, a)])
+        [vx + TRUSTED_TIME * ax, vy + TRUSTED_TIME * ay, vz + TRUSTED_TIME * az])

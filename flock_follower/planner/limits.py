@@ -59,7 +59,7 @@ def limit_norm(vector: ArrayLike, limit: float) -> Array:
     length = math.hypot(*numbers)
     if length < limit * INSIDE_SHARE:  # most often, and NaN fails
         return v
-    if not all(map(math.isfinite, numbers)):
+    if not (length < math.inf or all(map(math.isfinite, numbers))):
         return np.zeros_like(v)
     if length < SANE and math.sqrt(float(v @ v)) <= limit:  # longer ones might overflow
         return v

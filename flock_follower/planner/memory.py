@@ -74,8 +74,9 @@ def update_motions(motions: Mapping[str, Motion],
             if acceleration is None:
                 acceleration = [(v - w) / elapsed for v, w in zip(velocity, last.velocity)]
             share = math.expm1(-elapsed / SMOOTHING_TIME)
+            (x, y, z), (ax, ay, az) = last.acceleration, acceleration
             last = Motion(n.stamp, velocity, [
-                u - share * (a - u) for a, u in zip(acceleration, last.acceleration)])
+                x - share * (ax - x), y - share * (ay - y), z - share * (az - z)])
         updated[n.name] = last
     return updated
 

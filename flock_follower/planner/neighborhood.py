@@ -33,6 +33,7 @@ is unknown.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 import math
 from typing import NamedTuple
 
@@ -54,6 +55,12 @@ class Neighborhood(NamedTuple):
     """The known neighbors, all at one time, and their relations to the ego vehicle."""
 
     flock: Sequence[Neighbor]
+    positions: Array
+    """Positions of the flock (n, 3), m."""
+    distances: Array
+    """Distances between the centers (n,), m."""
+    radii: Array
+    """Sums of the radii of each neighbor and the ego vehicle (n,), m."""
     shares: Mapping[str, float]
     """1 with an edge, 0 without; in between while an edge fades in or out."""
     edges: frozenset[str]
@@ -62,20 +69,15 @@ class Neighborhood(NamedTuple):
     """The neighbor that the vehicle faces and keeps in sight."""
     level: Neighbor | None
     """The neighbor whose altitude the vehicle follows; None: the altitude is held."""
-    distances: Mapping[str, float]
-    """Distances between the centers, m."""
 
-    def clearance(self, n: Neighbor, params: PlannerParams) -> float:
-        """Return the distance between the ego hull and a neighbor's, m."""
-        return clearance(self.distances[n.name], n, params)
-
-
-NOBODY = Neighborhood((), {}, frozenset(), None, None, {})
+    @property
+    def clearances(self) -> Array:
+        """Return the distances between the ego hull and the neighbors' (n,), m."""
+        return np.maximum(self.distances - self.radii, 0.0)
 
 
-def clearance(distance: float, n: Neighbor, params: PlannerParams) -> float:
-    """Return the distance between the ego hull and a neighbor's, m, from that of the centers."""
-    return max(distance - (params.radius + n.member.radius), 0.0)
+NOBODY = Neighborhood(
+    (), np.zeros((0, 3)), np.zeros(0), np.zeros(0), {}, frozenset(), None, None)
 
 
 def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
@@ -86,29 +88,31 @@ def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
     :param memory: has the relations of the previous step, ``elapsed`` seconds ago.
     :param flock: all present neighbors, at one time; at least one of them can be followed.
     """
-    here = me.position.tolist()
-    distances = {n.name: math.dist(n.position.tolist(), here) for n in flock}
+    here, positions = me.position.tolist(), np.array([n.position for n in flock])
+    distances = [math.dist(there, here) for there in positions.tolist()]
+    around = (flock, positions, np.array(distances),
+              np.array([params.radius + n.member.radius for n in flock]))
     if len(flock) == 1:  # most often; one to avoid is never the only neighbor
         only = flock[0]
-        return Neighborhood(
-            flock, {only.name: 1.0}, frozenset([only.name]), only, only, distances)
+        return Neighborhood(*around, {only.name: 1.0}, frozenset([only.name]), only, only)
     joined = edges(memory.edges, me, flock, params)
     change, before = elapsed / max(params.handover_time, params.period), memory.shares
     shares = {n.name: min(max(before.get(n.name, 0.0) + (
         change if n.name in joined else -change), 0.0), 1.0) if before else float(n.name in joined)
         for n in flock}
+    away = {n.name: distance for n, distance in zip(flock, distances)}
     follow = [n for n in flock if n.member.role != AVOID]
     leaders = [n for n in follow if n.member.role == LEADER]
     ends = [n for n in follow if n.name in joined]
     # A leader without an edge has another vehicle before it, which must not leave the view.
     ahead = [n for n in leaders if n.name in joined]
-    seen = [[n for n in some if not n.received] for some in (ahead, ends, leaders)]
+    seen = ([n for n in some if not n.received] for some in (ahead, ends, leaders))
     # Never turn away from a neighbor in sight to one that is only received.
-    first = next(filter(None, [*seen, ahead, leaders, ends]), [])
-    faced = _find_nearest(distances, memory.faced, first)
+    first = next(filter(None, chain(seen, (ahead, leaders, ends))), [])
+    faced = _find_nearest(away, memory.faced, first)
     # Several followers without a leader would follow their own motion if they followed each other.
-    level = _find_nearest(distances, memory.faced, leaders) or (faced if len(ends) < 2 else None)
-    return Neighborhood(flock, shares, joined, faced, level, distances)
+    level = _find_nearest(away, memory.faced, leaders) or (faced if len(ends) < 2 else None)
+    return Neighborhood(*around, shares, joined, faced, level)
 
 
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
@@ -130,8 +134,9 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     # an edge does not begin beside others: it would pull past the vehicle between.
     kept = [n.name for n in seen if len(seen) == 1 and n.member.role == LEADER and (
         not held or n.name in held
-        or clearance(math.dist(n.position, me.position), n, params) ** 2 < params.law.d1)]
-    return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
+        or max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0) ** 2
+        < params.law.d1)]
+    return frozenset(n.name for n, edge in zip(follow, joined.tolist()) if edge or n.name in kept)
 
 
 def _find_nearest(distances: Mapping[str, float], held: str,
@@ -148,8 +153,8 @@ def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> l
     """Return warnings about neighbors that cannot be followed, or whose position is unknown."""
     v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
-    for n in neighbors.flock:
-        edge, distance = n.name in neighbors.edges, neighbors.clearance(n, params)
+    for n, distance in zip(neighbors.flock, neighbors.clearances.tolist()):
+        edge = n.name in neighbors.edges
         speed = math.hypot(*n.velocity.tolist())
         if edge and speed > KEPT_UP_WITH * v_max:
             found.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
@@ -205,7 +210,10 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
         return (np.zeros(3) if state is State.COAST else brake(
             velocity + retreating, params.strongest, params.brake_time_constant)), None
     flock = neighbors.flock
-    offsets = _offsets(neighbors, me, params)
+    distances = np.maximum(neighbors.distances, GAP_MIN)
+    # From the ego hull to those of the neighbors.
+    shortened = np.maximum(distances - neighbors.radii, GAP_MIN) / distances
+    offsets = (neighbors.positions - me.position) * shortened[:, None]
     differences = np.array([n.velocity for n in flock]) - me.velocity
     if len(flock) == 1:
         law = params.law.command(offsets, differences)
@@ -214,7 +222,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
         others = np.array([n.member.role == AVOID for n in flock])
         law = graph_law(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
-    if any(neighbors.clearance(n, params) ** 2 <= params.law.d0 for n in flock):
+    if float(neighbors.clearances.min()) ** 2 <= params.law.d0:
         return law, None  # too near already: no fade-in
     if memory.params is not params and memory.params != params:
         fading = np.zeros(3) if memory.command is None else memory.command, me.stamp
@@ -225,14 +233,3 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     if done >= 1.0 - 1e-9:
         return law, None
     return command + max(done, 0.0) * (limit_norm(law, params.a_max) - command), fading
-
-
-def _offsets(neighbors: Neighborhood, me: OwnState, params: PlannerParams) -> Array:
-    """Return the vectors (m, 3), m, from the ego hull to those of the neighbors."""
-    shares = []
-    for n in neighbors.flock:
-        distance = max(neighbors.distances[n.name], GAP_MIN)
-        gap = max(distance - (params.radius + n.member.radius), GAP_MIN)
-        shares.append([gap / distance])
-    offsets: Array = np.array([n.position for n in neighbors.flock]) - me.position
-    return offsets * np.array(shares)

@@ -177,7 +177,8 @@ def nearest_in_order(goal: complex, sides: Sequence[Side], discs: Discs) -> comp
     The bounds are in order of priority: if the earlier ones leave no room for a bound, it is met
     as nearly as they permit. A bound whose normal is zero is ignored.
     """
-    sides = [(normal, min(max(least, -_HUGE), _HUGE)) for normal, least in sides if normal]
+    sides = [(normal, math.copysign(_HUGE, least) if abs(least) > _HUGE else least)
+             for normal, least in sides if normal]
     point, k = optimum(goal, False, sides, discs)
     if k == len(sides):
         return point
@@ -195,8 +196,8 @@ def nearest_in_order(goal: complex, sides: Sequence[Side], discs: Discs) -> comp
         if j == k or slope == 0.0:
             continue
         there = (value - product(other, line.foot)) / slope
-        if slope > 0.0:
-            low = max(low, min(there, high))
-        else:
-            high = min(high, max(there, low))
+        if slope > 0.0 and there > low:
+            low = min(there, high)
+        elif slope < 0.0 and there < high:
+            high = max(there, low)
     return line.best_between(goal, False, low, high)

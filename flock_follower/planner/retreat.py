@@ -22,6 +22,7 @@ the gate brakes to ``fallback_retreat``. No function reads a clock.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -97,16 +98,16 @@ def fallback_retreat(memory: Memory, scene: Scene,
     """
     if not params.guard or params.retreat_max == 0.0:
         return None
-    coming, position = list[tuple[float, float, float, list[float]]](), scene.me.position.tolist()
+    around, position = list[tuple[float, str, Sequence[float]]](), scene.me.position.tolist()
     for n in memory.flock.values():
-        if scene.me.stamp - n.stamp > max_age(n, params):
-            continue
-        it = scene.predictions[n.name]
-        x, y, _ = difference(position, it.position)
-        distance = math.hypot(x, y)
-        length = max(distance, SHORTEST)
-        away = [x / length, y / length, 0.0]
-        gap = distance - params.radius - n.member.radius - params.edges.near - params.edges.margin
+        if scene.me.stamp - n.stamp <= max_age(n, params):
+            x, y, _ = difference(position, scene.predictions[n.name].position)
+            distance = math.hypot(x, y)
+            length = max(distance, SHORTEST)
+            around.append((distance - params.radius - n.member.radius - params.edges.near
+                           - params.edges.margin, n.name, (x / length, y / length, 0.0)))
+    for gap, name, away in sorted(around):
+        n, it = memory.flock[name], scene.predictions[name]
         approach, speed = max(scalar_product(away, it.velocity),
                               scalar_product(away, it.later)), 0.0
         if approach > APPROACH_NOISE:
@@ -120,12 +121,9 @@ def fallback_retreat(memory: Memory, scene: Scene,
                 approach = max(approach, min(
                     now + ODOMETRY_GAP * params.leader_acceleration_max, params.fastest))
         if speed > 0.0:
-            coming.append((gap, approach, speed, away))
-    if not coming:
-        return None
-    _, approach, speed, away = min(coming, key=lambda each: each[:2])
-    speed = min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP)
-    return FallbackRetreat(speed * np.array(away), approach)
+            speed = min(speed, params.fastest, _longest_retreat(approach, params) / ODOMETRY_GAP)
+            return FallbackRetreat(speed * np.array(away), approach)
+    return None
 
 
 def _newest_acceleration(n: Neighbor, memory: Memory) -> list[float]:

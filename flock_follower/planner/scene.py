@@ -117,7 +117,8 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
         memory.motions, flock.values()) if flock else memory.motions)
     scene = Scene(state, me, blinded, neighbors, leader, missed, {
         name: _predict(n, brought_up, me, params) for name, n in flock.items()})
-    return brought_up._replace(lost=_loss(memory, flock, scene, params)), scene
+    lost = _loss(memory, flock, scene, params)
+    return brought_up if lost is memory.lost else brought_up._replace(lost=lost), scene
 
 
 def _predict(n: Neighbor, memory: Memory, me: OwnState,

@@ -80,13 +80,15 @@ def step(memory: Memory, inputs: Inputs, params: PlannerParams) -> tuple[Memory,
         memory, decision = relative.step(memory, memory.own, now, params, elapsed)
         return memory, decision._replace(rejected=rejected)
     blinded = blind(inputs.looked, now, params)
-    memory, state, reason, newest = _mode(memory, inputs, params, blinded)
+    me = None if memory.own is None else propagate(memory.own, now)
+    memory, state, reason, newest = _mode(memory, me, inputs, params, blinded)
     if state is State.IDLE:
         return memory.begun_afresh(), Decision(state, reason, rejected=rejected)
-    if memory.own is None or memory.given_up or odometry_fault(memory.own, now, params):
+    if (memory.own is None or me is None
+            or memory.given_up or odometry_fault(memory.own, now, params)):
         memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
         return memory, Decision(state, reason, rejected=rejected)
-    me, tracking = propagate(memory.own, now), state is State.TRACK
+    tracking = state is State.TRACK
     # Velocity that was commanded and flown since the measurement, m/s; the rest is pending.
     flown = memory.pending * (max(now - memory.own.stamp, 0.0) / params.response_time)
     memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
@@ -120,7 +122,7 @@ def step(memory: Memory, inputs: Inputs, params: PlannerParams) -> tuple[Memory,
         tuple(sorted(neighbors.edges)))
 
 
-def _mode(memory: Memory, inputs: Inputs, params: PlannerParams,
+def _mode(memory: Memory, me: OwnState | None, inputs: Inputs, params: PlannerParams,
           blinded: str) -> tuple[Memory, State, str, float | None]:
     """
     Return memory, state, the reason for the state, and the stamp of the newest estimate, s.
@@ -130,7 +132,7 @@ def _mode(memory: Memory, inputs: Inputs, params: PlannerParams,
     """
     now = inputs.now
     fault = odometry_fault(memory.own, now, params)
-    occluded = None if fault else _judge_occlusion(memory, inputs)
+    occluded = None if fault or me is None else _judge_occlusion(memory, me, inputs)
     follow = [n for n in memory.neighbors.values() if n.member.role != AVOID and (
         occluded is None or n.received or n.name != memory.faced)]
     seen, received = (max((n.stamp for n in follow if n.received is by_message), default=None)
@@ -148,11 +150,10 @@ def _mode(memory: Memory, inputs: Inputs, params: PlannerParams,
     return memory, state, reason, received if seen is None else seen
 
 
-def _judge_occlusion(memory: Memory, inputs: Inputs) -> Occlusion | None:
+def _judge_occlusion(memory: Memory, me: OwnState, inputs: Inputs) -> Occlusion | None:
     """Return the occlusion of the faced neighbor, or None."""
-    if memory.own is None or memory.followed is None:
+    if memory.followed is None:
         return None
-    me = propagate(memory.own, inputs.now)
     n = memory.neighbors.get(memory.faced) or memory.flock.get(memory.faced)
     sent = np.zeros(3) if memory.command is None else memory.command
     forward = math.cos(me.yaw) * sent[0] + math.sin(me.yaw) * sent[1]

@@ -12,7 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Vectors (3,) as plain numbers, which take a tenth of the time of arrays."""
+"""
+Vectors (3,) as plain numbers, which take a tenth of the time of arrays.
+
+Arrays over all neighbors pay late, too: to predict n neighbors and to compute their bounds takes
+about 7.5 n us in numbers, and 100 + 2.5 n us in arrays.
+"""
 
 from __future__ import annotations
 

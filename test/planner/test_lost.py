@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 from typing import Any
@@ -28,7 +29,7 @@ import pytest
 
 from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import wrap_angle
-from flock_follower.planner.inputs import FRESH, predict
+from flock_follower.planner.inputs import FRESH, Neighbor, predict
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
@@ -249,10 +250,23 @@ def fallback(distance: float, closing: float, turning: float, own_speed: float,
     """Return the retreat from a leader ahead; speeds towards it, and its acceleration, are +."""
     n = seen(0.0, (distance, 0.0, 2.0), (-closing, 0.0, 0.0),
              acceleration=np.array([-turning, 0.0, 0.0]))
+    return fallback_from([n], own_speed, params)
+
+
+def fallback_from(neighbors: Sequence[Neighbor], own_speed: float,
+                  params: PlannerParams) -> FallbackRetreat | None:
     me = own(0.0, velocity=(own_speed, 0.0, 0.0))
-    memory, scene = survey(Memory(now=0.0, own=me, neighbors={'leader': n}), me, State.TRACK,
-                           False, params, params.period)
+    memory, scene = survey(Memory(now=0.0, own=me, neighbors={n.name: n for n in neighbors}), me,
+                           State.TRACK, False, params, params.period)
     return fallback_retreat(memory, scene, params)
+
+
+def test_the_retreat_is_from_the_nearest_one_that_comes() -> None:
+    goes = seen(0.0, (-1.6, 0.0, 2.0), (-0.3, 0.0, 0.0), 'nearest')
+    ahead = seen(0.0, (2.4, 0.0, 2.0), (-0.3, 0.0, 0.0), 'farthest')
+    left = seen(0.0, (0.0, 2.0, 2.0), (0.0, -0.2, 0.0), 'nearer')
+    found = fallback_from([ahead, left, goes], 0.0, PARAMS)
+    assert found is not None and found.velocity == pytest.approx([0.0, -0.2, 0.0], abs=0.01)
 
 
 @pytest.mark.parametrize(('distance', 'closing', 'turning', 'v_max'), [
