@@ -229,11 +229,12 @@ def _basis(pose: Transform, model: SmearModel) -> Array:
 def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) -> _Seen | None:
     """Return the brightness at places (3, s) on a marker; None if too few are in the image."""
     points = places.T.dot(basis.T)
-    if not points[:, 2].min() > _MIN_DEPTH:
+    if not np.minimum.reduce(points[:, 2]) > _MIN_DEPTH:
         return None
     pixels = camera.project(points)
-    x, y = pixels.T.copy()
-    left, top, right, bottom = x.min(), y.min(), x.max(), y.max()
+    xy = pixels.T.copy()
+    left, top = np.minimum.reduce(xy, axis=1).tolist()
+    right, bottom = np.maximum.reduce(xy, axis=1).tolist()
     inside: Any = None
     # Written so that NaN is outside.
     if not (left >= 0.0 and top >= 0.0 and right <= camera.width - 1
@@ -427,7 +428,7 @@ def _by_pose(basis: Array, places: Array, center: Array, right: Array, down: Arr
     np.negative(down, out=along[1])
     np.multiply(places[0], right, out=along[2])
     along[2] += places[1] * down
-    x, y, z = np.dot(np.linalg.inv(basis).T, along, out=design[:3])
+    x, y, z = np.dot(cv2.invert(basis)[1].T, along, out=design[:3])
     middle = basis.copy()
     middle[:, 2] -= center
     arm_x, arm_y, arm_z = middle.dot(places)
