@@ -85,11 +85,14 @@ def mirror(pose: Transform, center: Array, facing_along: Array) -> Transform | N
     :param center: of the marker (3,), in the camera's optical frame, m; it does not move.
     :param facing_along: the marker's normal (3,) on the body.
     """
-    normal, sight = pose.rotation @ facing_along, center / np.linalg.norm(center)
-    other = -normal + 2.0 * float(normal @ sight) * sight
-    axis = np.cross(normal, other)
-    sine = float(np.linalg.norm(axis))
+    # In plain numbers: for every smeared image, and so small.
+    a, b, c = pose.rotation.dot(facing_along).tolist()
+    x, y, z = (center / math.sqrt(center.dot(center))).tolist()
+    along = 2.0 * (a * x + b * y + c * z)
+    u, v, w = along * x - a, along * y - b, along * z - c  # the mirrored normal
+    axis = np.array([b * w - c * v, c * u - a * w, a * v - b * u])
+    sine = math.sqrt(axis.dot(axis))
     if sine < SAME_ATTITUDE:
         return None
-    turn = axis / sine * math.atan2(sine, float(normal @ other))
-    return apply_step(pose, center, np.concatenate([np.zeros(3), turn]))
+    turn = axis / sine * math.atan2(sine, a * u + b * v + c * w)
+    return apply_step(pose, center, np.array([0.0, 0.0, 0.0, *turn.tolist()]))
