@@ -188,8 +188,10 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
             found, sharp = _fit_shown(image, camera, sought.model, other, None)
     if sharp:
         return None, None
-    if found is not None:  # from afar it may have settled early
-        return fit(image, camera, found.lines.model, found.pose, found.spacing) or found, whole
+    if found is not None:
+        if whole is None or found.blur <= RUN_TOGETHER:  # from afar it may have settled early
+            found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
+        return found, whole
     return None, whole if smeared else _fit_whole(image, camera, sought, starts)
 
 
