@@ -130,7 +130,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     found: EdgeFit | None = None
     whole: _Whole | None = None
     if not smeared:
-        found, sharp = _fit_shown(image, camera, sought.model, expected.pose, spacing)
+        found, sharp, _ = _fit_shown(image, camera, sought.model, expected.pose, spacing)
         if sharp:
             return None
     if found is None:  # it is smeared, or it moved farther than expected
@@ -179,20 +179,20 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
     if whole is not None and whole.fit.blur > EDGELESS:
         return None, whole
     place = starts[0][1].pose if starts else pose
-    found, sharp = _fit_shown(image, camera, sought.model,
-                              place if whole is None else whole.fit.pose, None)
+    found, sharp, plain = _fit_shown(image, camera, sought.model,
+                                     place if whole is None else whole.fit.pose, None)
     if whole is not None and found is None and not sharp:
         # Little smear leaves edges: if they are not there, the attitude may be the mirrored one.
         other = _mirrored_body(sought, whole.number, whole.fit.pose)
         if other is not None:
-            found, sharp = _fit_shown(image, camera, sought.model, other, None)
+            found, sharp, plain = _fit_shown(image, camera, sought.model, other, None)
     if sharp:
         return None, None
     if found is not None:
         if whole is None or found.blur <= RUN_TOGETHER:  # from afar it may have settled early
             found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
         return found, whole
-    return None, whole if smeared else _fit_whole(image, camera, sought, starts)
+    return None, whole if smeared or plain else _fit_whole(image, camera, sought, starts)
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,
@@ -284,10 +284,12 @@ class _Shown(NamedTuple):
     A fit to those markers that show their codes, if any.
 
     ``sharp``: whether the edges of a single marker are clear, so that none of it is smeared.
+    ``plain``: whether they are there but not its code, so that something covers it.
     """
 
     fit: EdgeFit | None
     sharp: bool = False
+    plain: bool = False
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
@@ -302,7 +304,8 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if shown is not None and shown.all():
         return _Shown(found)
     if len(seen.codes) == 1:
-        return _Shown(None, found is not None and _sharp(found))
+        return _Shown(None) if found is None else _Shown(
+            None, _sharp(found), found.blur < PLAIN_BLUR)
     if shown is None:  # one that is covered spoils them all
         alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
                  for k in range(len(seen.codes))]
