@@ -40,7 +40,13 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
-from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
+from flock_follower.perception.neighbor_motion import (
+    ATTITUDE,
+    Estimate,
+    POSITION,
+    STATE_SIZE,
+    VELOCITY,
+)
 from flock_follower.perception.pose import contradicts, locate, MAX_TURN, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.square_pose import refine
@@ -51,7 +57,9 @@ from flock_follower.perception.time_offset import MountedCamera
 CONFIRM_PERIOD = 0.2
 #: Error of a measured direction that covariances of edges lack, px: blur, JPEG, and calibration.
 DIRECTION_ERROR = 0.06
-_VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
+#: 1 for the variances of the velocity in those of an error state, (15, 15).
+_VELOCITY_VARIANCES = np.zeros((STATE_SIZE, STATE_SIZE))
+_VELOCITY_VARIANCES[VELOCITY, VELOCITY] = np.eye(3)
 
 
 class CameraMotion(NamedTuple):
@@ -116,11 +124,10 @@ def reported(estimate: Estimate, stamp: float, own: OdometrySample, attitude: fl
         :param velocity: of the ego velocity, (m/s)^2, per axis: the filter averages over both.
     """
     x, y, z = (estimate.position - own.travel).tolist()
-    covariance = estimate.covariance.copy()
+    covariance = estimate.covariance + velocity * _VELOCITY_VARIANCES
     covariance[POSITION, POSITION] += attitude * np.array(
         [[y * y + z * z, -x * y, -x * z], [-x * y, x * x + z * z, -y * z],
          [-x * z, -y * z, x * x + y * y]])
-    covariance[_VELOCITIES, _VELOCITIES] += velocity
     return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
                              covariance=covariance)
 
