@@ -428,8 +428,8 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
 def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
     lines, codes = found.lines, found.lines.model.codes
-    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code, tracked)
-                     for k, code in enumerate(codes)])
+    return np.array([shows_code(image, lines.cells[part], code, tracked)
+                     for part, code in zip(lines.model.cell_slices, codes)])
 
 
 def _scale(found: EdgeFit) -> float:

@@ -303,6 +303,9 @@ class EdgeModel:
         self.shares = np.full(len(self), 1.0 / max(len(self), 1))
         # Where the derivatives of each edge begin, of N_DERIVATIVES each, (n,).
         self.begins = N_DERIVATIVES * np.arange(len(self))
+        # The cells of each marker, among all of them.
+        begins = np.cumsum([0, *(len(code.centers) for code in codes)]).tolist()
+        self.cell_slices = [slice(*ends) for ends in pairwise(begins)]
         self._parts: dict[bytes, EdgeModel] = {}
 
     def __len__(self) -> int:
