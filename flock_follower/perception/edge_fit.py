@@ -322,8 +322,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         alike = all(1.0 / _MAX_MISMATCH < a / b < _MAX_MISMATCH for a, b in zip(suited, spacing))
         before, share = share, float(step.weights.sum()) / len(model)
         clear = share > _REFIND_BELOW or (count > 0 and share < before + _LEAST_GAIN)
-        farthest = float(np.maximum.reduce(np.abs(step.explained)))
-        turned = turn > _REPROJECT_TURN
+        farthest, turned = float(np.abs(step.explained).max()), turn > _REPROJECT_TURN
         near = _REFIND_BEYOND * min(lines.narrowest)
         settled = farthest * farthest < near and alike and clear and not turned
         if settled or count == _MAX_PASSES - 1:

@@ -31,7 +31,6 @@ import numpy as np
 
 from flock_follower.geometry import Array, skew
 
-_EYE_6 = np.eye(6)
 ALIKE_TIME = 0.25  # s, time constant of the errors
 FORGET_AFTER = 6.0  # time constants without such a measurement until the errors are forgotten
 
@@ -105,7 +104,7 @@ def to_body(lever: Array) -> Array:
     ``lever`` (3,) is the vector from the body's origin to the point, in odom: p = p_point - R l,
     so dp = dp_point + [R l]x dr.
     """
-    matrix = _EYE_6.copy()
+    matrix = np.eye(6)
     matrix[:3, 3:] = skew(lever)
     return matrix
 

@@ -304,8 +304,8 @@ class EdgeModel:
         # Where the derivatives of each edge begin, of N_DERIVATIVES each, (n,).
         self.begins = N_DERIVATIVES * np.arange(len(self))
         # The cells of each marker, among all of them.
-        begins = np.cumsum([0, *(len(code.centers) for code in codes)]).tolist()
-        self.cell_slices = [slice(*ends) for ends in pairwise(begins)]
+        self.cell_slices = [slice(*ends) for ends in pairwise(
+            np.cumsum([0, *(len(code.centers) for code in codes)]).tolist())]
         self._parts: dict[bytes, EdgeModel] = {}
 
     def __len__(self) -> int:

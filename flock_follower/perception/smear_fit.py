@@ -233,8 +233,8 @@ def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) ->
         return None
     pixels = camera.project(points)
     xy = pixels.T.copy()
-    left, top = np.minimum.reduce(xy, axis=1).tolist()
-    right, bottom = np.maximum.reduce(xy, axis=1).tolist()
+    (left, top), (right, bottom) = (
+        end.reduce(xy, axis=1).tolist() for end in (np.minimum, np.maximum))
     inside: Any = None
     # Written so that NaN is outside.
     if not (left >= 0.0 and top >= 0.0 and right <= camera.width - 1
