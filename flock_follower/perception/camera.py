@@ -220,7 +220,7 @@ class CameraModel:
             g = np.where(r2 <= self.radius**2, g, np.nan)
         distorted = xy * g[:, None]
         if self._aside is not None:
-            products = np.empty((len(xy), 3))
+            products = np.empty((3, len(xy))).T
             products[:, :2] = squares
             np.multiply(xy[:, 0], xy[:, 1], out=products[:, 2])
             distorted += products.dot(self._aside)

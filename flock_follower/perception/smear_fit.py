@@ -228,7 +228,7 @@ def _basis(pose: Transform, model: SmearModel) -> Array:
 
 def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) -> _Seen | None:
     """Return the brightness at places (3, s) on a marker; None if too few are in the image."""
-    points = places.T.dot(basis.T)
+    points = basis.dot(places).T
     if not np.minimum.reduce(points[:, 2]) > _MIN_DEPTH:
         return None
     pixels = camera.project(points)
@@ -468,7 +468,7 @@ def _shows_code(model: SmearModel, end: SmearStart, last: _Descent) -> bool:
     # What turning cells adds to the squares left, once the response is fitted anew.
     response, residual = last.response, last.residual
     by_response = turned.dot(response.T)
-    refit = np.linalg.solve(response.dot(response.T) + _RIDGE, by_response.T).T
+    refit = cv2.solve(response.dot(response.T) + _RIDGE, by_response.T)[1].T
     by_residual = turned.dot(residual) - refit.dot(response.dot(residual))
     together = turned.dot(turned.T) - refit.dot(by_response.T)
     if np.count_nonzero(together.diagonal() <= 2.0 * by_residual) > model.errors:
