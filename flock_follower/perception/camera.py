@@ -61,7 +61,7 @@ _SIZE = Range(1, 65535, 'px', whole=True)
 #: Beyond this radius in normalized coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
 #: Least r^2 at which a fisheye's radial factor is computed: at 0 it is 0 / 0.
-_CENTRAL = 1e-8
+_MIN_SQUARED_RADIUS = 1e-8
 
 
 def off_center(shares: Array) -> bool:
@@ -285,7 +285,7 @@ class CameraModel:
         """Return the radial factor g(r^2)."""
         if self.model == 'equidistant':
             k1, k2, k3, k4 = self.distortion.tolist()
-            r = np.sqrt(np.maximum(r2, _CENTRAL))
+            r = np.sqrt(np.maximum(r2, _MIN_SQUARED_RADIUS))
             t = np.arctan(r)
             t2 = t * t
             return t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
@@ -301,7 +301,7 @@ class CameraModel:
         g = self._radial(r2)
         if self.model == 'equidistant':
             k1, k2, k3, k4 = self.distortion.tolist()
-            safe = np.maximum(r2, _CENTRAL)
+            safe = np.maximum(r2, _MIN_SQUARED_RADIUS)
             t2 = np.arctan(np.sqrt(safe))**2
             slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
             return g, (slope / (1.0 + safe) - g) / (2.0 * safe)
