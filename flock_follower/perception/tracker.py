@@ -360,9 +360,10 @@ class Tracker:
 
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
         """Return whether a measurement is of a candidate, not of the primary track."""
-        name, place = measurement.name, look.view.T_smooth_camera @ measurement.T_camera_body
-        return self._hypotheses[name].candidate_at(
-            self._time(name, look.camera, look.exposed), place.translation) is not None
+        name, hypotheses = measurement.name, self._hypotheses[measurement.name]
+        return bool(hypotheses.candidates) and hypotheses.candidate_at(
+            self._time(name, look.camera, look.exposed),
+            (look.view.T_smooth_camera @ measurement.T_camera_body).translation) is not None
 
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbors that are not measured yet."""
