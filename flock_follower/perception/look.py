@@ -87,8 +87,9 @@ class CameraMotion(NamedTuple):
 
     def prior(self, estimate: Estimate | None) -> PosePrior:
         """Return the expected pose of a neighbor, given its estimate or None."""
-        pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
-        return PosePrior(pose, self.T_smooth_camera.rotation[2])
+        return PosePrior(
+            None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose,
+            self.T_smooth_camera.rotation[2])
 
     def moving(self, sight: Array) -> Array:
         """Return the change of the measured state (15,) per s of time offset; sight (3,), m."""
@@ -297,8 +298,8 @@ class Look:
     def distance(self, measurement: Measurement) -> float:
         """Return a body's distance from the neighbor's expected place, or from the camera, m."""
         expected = self.expected[measurement.name].pose
-        place = np.zeros(3) if expected is None else expected.translation
-        return math.dist(measurement.T_camera_body.translation, place)
+        return math.dist(measurement.T_camera_body.translation,
+                         np.zeros(3) if expected is None else expected.translation)
 
     def known(self, measurement: Measurement, side: float) -> bool:
         """Return whether a body was already measured at the same place, to within ``side``, m."""

@@ -118,8 +118,8 @@ class Estimate(NamedTuple):
     @property
     def child_acceleration_covariance(self) -> Array:
         """Return the covariance (3, 3) of ``child_acceleration``, without the attitude's share."""
-        own = self.covariance[ACCELERATION, ACCELERATION]
-        covariance: Array = self.rotation.T @ own @ self.rotation
+        covariance: Array = self.rotation.T @ self.covariance[
+            ACCELERATION, ACCELERATION] @ self.rotation
         return covariance
 
     @property

@@ -424,9 +424,12 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
 
 def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
-    lines, codes = found.lines, found.lines.model.codes
-    return np.array([shows_code(image, lines.cells[part], code, tracked)
-                     for part, code in zip(lines.model.cell_slices, codes)])
+    lines, model = found.lines, found.lines.model
+    # More edges would be out of place if one of the markers had the code of any other.
+    clear = tracked and found.rms < SHARP_RMS and (
+        (1.0 - found.inlier_share) * len(model) < 0.5 * model.distinct)
+    return np.array([clear or shows_code(image, lines.cells[part], code, tracked)
+                     for part, code in zip(model.cell_slices, model.codes)])
 
 
 def _scale(found: EdgeFit) -> float:

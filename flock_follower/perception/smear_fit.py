@@ -366,8 +366,7 @@ def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int)
     """Return the index of the blur of a lens in focus at a pose; one out of focus stays."""
     if lens >= N_FOCUSED:
         return lens
-    depth = float(pose.apply(model.middle[None])[0, 2])
-    blur = _LENS_BLUR * depth / (camera.matrix[0, 0] * model.cell)
+    blur = _LENS_BLUR * pose.apply(model.middle)[2] / (camera.matrix[0, 0] * model.cell)
     return int(np.abs(LENS_BLURS[:N_FOCUSED] - blur).argmin())
 
 
