@@ -204,8 +204,7 @@ class CameraModel:
         NaN if a point is behind the camera, or so far off the axis that the distortion is not
         one-to-one.
         """
-        p = np.asarray(points, dtype=float).reshape(-1, 3)
-        return self.distort(_normalized(p)[0])
+        return self.distort(_normalized(np.asarray(points, dtype=float).reshape(-1, 3))[0])
 
     def distort(self, xy: Array) -> Array:
         """

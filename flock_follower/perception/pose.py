@@ -90,6 +90,8 @@ MAX_TURN = 0.3
 #: Most steps of the fits to a smeared print in one image, of both attitudes together. If the steps
 #: do not suffice for the mirrored one, it is fitted in a later image.
 MAX_STEPS = 9
+#: Most steps of a fit from the smear of the last image, before smear and place are searched for.
+AS_BEFORE_STEPS = 6
 #: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
 #: residuals are errors of the model, which are alike for neighboring samples.
 EFFECTIVE_SMEAR_SAMPLES = 40.0
@@ -337,7 +339,8 @@ def _fit_as_before(image: GrayImage, camera: CameraModel, sought: Target, pose: 
     """Return the fit to a single marker whose print is smeared as in the last image, or None."""
     if last.smear is None or not facing(sought.model, pose).all():
         return None
-    found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True)
+    found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True,
+                    AS_BEFORE_STEPS)
     return None if found is None else _Whole(0, found)
 
 
