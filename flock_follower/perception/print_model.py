@@ -18,10 +18,10 @@ The print of a marker: its edges for the fit, its cells, and whether an image sh
 Edge points are on the borders between black and white cells, but not near the ends of a straight
 border, where blur rounds the corner.
 
-``shows_code`` makes the final decision on a tracked marker. Light on a marker may be uneven: white
-in a shadow may be darker than black in the sun. In a window of a few cells on one side of the
-shadow's edge, black and white can still be distinguished. So each cell is compared with the cells
-around it, in the window that agrees best with the code.
+``shows_code`` makes the final decision on a tracked marker, unless almost all its edges are in
+place. Light on a marker may be uneven: white in a shadow may be darker than black in the sun. In a
+window of a few cells on one side of the shadow's edge, black and white can still be distinguished.
+So each cell is compared with the cells around it, in the window that agrees best with the code.
 """
 
 from __future__ import annotations
