@@ -62,6 +62,8 @@ AXIS_RANGE = Range(-100.0, 101.0)
 _SIZE = Range(1, 65535, 'px', whole=True)
 #: Beyond this radius in normalized coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
+#: Least r^2 at which a fisheye's radial factor is computed: at 0 it is 0 / 0.
+_MIN_SQUARED_RADIUS = 1e-8
 
 
 def off_center(shares: Array) -> bool:
@@ -204,8 +206,7 @@ class CameraModel:
         NaN if a point is behind the camera, or so far off the axis that the distortion is not
         one-to-one.
         """
-        p = np.asarray(points, dtype=float).reshape(-1, 3)
-        return self.distort(self._normalized(p)[0])
+        return self.distort(_normalized(np.asarray(points, dtype=float).reshape(-1, 3))[0])
 
     def distort(self, xy: Array) -> Array:
         """
@@ -220,7 +221,7 @@ class CameraModel:
             g = np.where(r2 <= self.radius**2, g, np.nan)
         distorted = xy * g[:, None]
         if self._aside is not None:
-            products = np.empty((len(xy), 3))
+            products = np.empty((3, len(xy))).T
             products[:, :2] = squares
             np.multiply(xy[:, 0], xy[:, 1], out=products[:, 2])
             distorted += products.dot(self._aside)
@@ -246,7 +247,10 @@ class CameraModel:
         The Jacobian d pixel / d point is (N, 2, 3), px/m.
         """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
-        xy, depth = self._normalized(p)
+        xy, depth = _normalized(p)
+        outside = ~((xy * xy).sum(axis=1) <= self.radius**2)
+        if outside.any():
+            xy[outside] = np.nan
         by_point = np.empty((len(p), 2, 3))
         by_xy = np.array(self._slopes(xy[:, 0], xy[:, 1])).T.reshape(-1, 2, 2)
         by_point[:, :, :2] = self.matrix[:2, :2] @ by_xy
@@ -278,21 +282,14 @@ class CameraModel:
         xy[~(np.max(np.abs(error), axis=1, initial=0.0) < 1e-10)] = np.nan
         return xy
 
-    def _normalized(self, points: Array) -> tuple[Array, Array]:
-        """Return (X/Z, Y/Z) (N, 2), NaN if a point is not projected, and depths (N, 1), m."""
-        depth = points[:, 2:]
-        if not depth.min(initial=1.0) > 1e-9:
-            depth = np.where(depth > 1e-9, depth, np.nan)
-        xy = points[:, :2] / depth
-        outside = ~((xy * xy).sum(axis=1) <= self.radius**2)
-        if outside.any():
-            xy[outside] = np.nan
-        return xy, depth
-
     def _radial(self, r2: Any) -> Any:
         """Return the radial factor g(r^2)."""
         if self.model == 'equidistant':
-            return self._scale(r2)[0]
+            k1, k2, k3, k4 = self.distortion.tolist()
+            r = np.sqrt(np.maximum(r2, _MIN_SQUARED_RADIUS))
+            t = np.arctan(r)
+            t2 = t * t
+            return t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
         k1, k2, _, _, k3, *rational = self.distortion.tolist()
         g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)) if k3 else 1.0 + r2 * (k1 + r2 * k2)
         if rational:
@@ -302,20 +299,14 @@ class CameraModel:
 
     def _scale(self, r2: Any) -> tuple[Any, Any]:
         """Return the radial factor g(r^2) and its derivative dg / d(r^2)."""
-        if self.model == 'equidistant':
-            k1, k2, k3, k4 = self.distortion
-            safe = np.maximum(r2, 1e-8)
-            r = np.sqrt(safe)
-            t = np.arctan(r)
-            t2 = t * t
-            g = t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
-            slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            dg = (slope / (1.0 + safe) - g) / (2.0 * safe)
-            # At the center both are limits: t = r - r^3 / 3.
-            near = r2 < 1e-8
-            return np.where(near, 1.0, g), np.where(near, k1 - 1.0 / 3.0, dg)
-        k1, k2, _, _, k3, *rational = self.distortion.tolist()
         g = self._radial(r2)
+        if self.model == 'equidistant':
+            k1, k2, k3, k4 = self.distortion.tolist()
+            safe = np.maximum(r2, _MIN_SQUARED_RADIUS)
+            t2 = np.arctan(np.sqrt(safe))**2
+            slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            return g, (slope / (1.0 + safe) - g) / (2.0 * safe)
+        k1, k2, _, _, k3, *rational = self.distortion.tolist()
         dg = k1 + r2 * (2 * k2 + r2 * (3 * k3))
         if rational:
             k4, k5, k6 = rational[:3]
@@ -352,6 +343,14 @@ class CameraModel:
         m, n, q, r = ((m - t * across) / depth, (n - w * across) / depth,
                       (q - t * down) / depth, (r - w * down) / depth)
         return m * a + n * c, m * b + n * d, q * a + r * c, q * b + r * d
+
+
+def _normalized(points: Array) -> tuple[Array, Array]:
+    """Return (X/Z, Y/Z) (N, 2), NaN if a point is behind the camera, and depths (N, 1), m."""
+    depth = points[:, 2:]
+    if not depth.min(initial=1.0) > 1e-9:
+        depth = np.where(depth > 1e-9, depth, np.nan)
+    return points[:, :2] / depth, depth
 
 
 def _tilt(tx: float, ty: float) -> Array:

@@ -83,6 +83,8 @@ _MIN_CORRECTED = 2.5
 _MIN_BLUR_VARIANCE = 1e-9
 #: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbor.
 _INNER_INDEX = np.array([1, *range(1, 2 * _HALF_WIDTH), 2 * _HALF_WIDTH - 1])
+#: Added to indices (n,): those of the sample before each, of each and of the one after.
+_ADJACENT = np.array([[-1], [0], [1]])
 #: Sums both columns of (n, 2).
 _ONES = np.ones(2)
 #: Subtracts the second column of (n, 2) from the first.
@@ -140,8 +142,7 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
     peak = slope.argmax(axis=1)
     within = _INNER_INDEX[peak]
     index = model.begins + within
-    values = slope.ravel()
-    before, top, after = values[index - 1], values[index], values[index + 1]
+    before, top, after = slope.ravel().take(_ADJACENT + index)
     bend = np.minimum(before - 2.0 * top + after, -1e-3)
     typical = median(top)
     faint = _MIN_SLOPE_SHARE if min(lines.narrowest) > _NARROW_CELL else _MIN_SLOPE_SHARE_NARROW

@@ -132,8 +132,7 @@ def facing(model: EdgeModel, pose: Transform) -> Any:
 
 
 def has_converged(pose: Transform) -> bool:
-    x, y, z = pose.translation.tolist()
-    return abs(x) + abs(y) + abs(z) < _DIVERGED
+    return sum(map(abs, pose.translation.tolist())) < _DIVERGED
 
 
 def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | None:

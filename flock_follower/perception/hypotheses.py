@@ -223,8 +223,9 @@ class Hypotheses:
                         covariance: Array, alike: Array | None) -> UpdateOutcome:
         """Update the primary track with a measurement, if both can be of one body."""
         last, reach = self.primary.newest, self._reach(time)
-        if last is not None and time > last.stamp and self.primary.place(time) is None and (
-                math.dist(measured.translation, last.position) > reach):
+        if last is not None and time > last.stamp and (
+                math.dist(measured.translation, last.position) > reach) and (
+                self.primary.place(time) is None):
             return UpdateOutcome.OUTLIER
         surprised = last is None or time - last.stamp <= GAP
         outcome = self.primary.update(time, measured, reference, covariance,

@@ -266,6 +266,5 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
 
 def gray_levels(image: GrayImage, pixels: Array) -> Any:
     """Return the brightness (n,) at pixels (n, 2); outside the image, that of its border."""
-    at = pixels.astype(np.float32)[:, None]
-    return cv2.remap(image, at, None, cv2.INTER_LINEAR,
+    return cv2.remap(image, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR,
                      borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)

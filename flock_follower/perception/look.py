@@ -40,7 +40,13 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
-from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
+from flock_follower.perception.neighbor_motion import (
+    ATTITUDE,
+    Estimate,
+    POSITION,
+    STATE_SIZE,
+    VELOCITY,
+)
 from flock_follower.perception.pose import contradicts, locate, MAX_TURN, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.square_pose import refine
@@ -51,7 +57,9 @@ from flock_follower.perception.time_offset import MountedCamera
 CONFIRM_PERIOD = 0.2
 #: Error of a measured direction that covariances of edges lack, px: blur, JPEG, and calibration.
 DIRECTION_ERROR = 0.06
-_VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
+#: 1 for the variances of the velocity in those of an error state, (15, 15).
+_VELOCITY_VARIANCES = np.zeros((STATE_SIZE, STATE_SIZE))
+_VELOCITY_VARIANCES[VELOCITY, VELOCITY] = np.eye(3)
 
 
 class CameraMotion(NamedTuple):
@@ -79,8 +87,9 @@ class CameraMotion(NamedTuple):
 
     def prior(self, estimate: Estimate | None) -> PosePrior:
         """Return the expected pose of a neighbor, given its estimate or None."""
-        pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
-        return PosePrior(pose, self.T_smooth_camera.rotation[2])
+        return PosePrior(
+            None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose,
+            self.T_smooth_camera.rotation[2])
 
     def moving(self, sight: Array) -> Array:
         """Return the change of the measured state (15,) per s of time offset; sight (3,), m."""
@@ -116,11 +125,10 @@ def reported(estimate: Estimate, stamp: float, own: OdometrySample, attitude: fl
         :param velocity: of the ego velocity, (m/s)^2, per axis: the filter averages over both.
     """
     x, y, z = (estimate.position - own.travel).tolist()
-    covariance = estimate.covariance.copy()
+    covariance = estimate.covariance + velocity * _VELOCITY_VARIANCES
     covariance[POSITION, POSITION] += attitude * np.array(
         [[y * y + z * z, -x * y, -x * z], [-x * y, x * x + z * z, -y * z],
          [-x * z, -y * z, x * x + y * y]])
-    covariance[_VELOCITIES, _VELOCITIES] += velocity
     return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
                              covariance=covariance)
 
@@ -290,8 +298,8 @@ class Look:
     def distance(self, measurement: Measurement) -> float:
         """Return a body's distance from the neighbor's expected place, or from the camera, m."""
         expected = self.expected[measurement.name].pose
-        place = np.zeros(3) if expected is None else expected.translation
-        return math.dist(measurement.T_camera_body.translation, place)
+        return math.dist(measurement.T_camera_body.translation,
+                         np.zeros(3) if expected is None else expected.translation)
 
     def known(self, measurement: Measurement, side: float) -> bool:
         """Return whether a body was already measured at the same place, to within ``side``, m."""

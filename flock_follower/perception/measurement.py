@@ -93,8 +93,7 @@ def _attitude_chi2(pose: Transform, expected: PosePrior) -> float:
 
 def angle(a: Transform, b: Transform) -> float:
     """Return the angle between two attitudes, rad."""
-    trace = float(np.sum(a.rotation * b.rotation))
-    return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
+    return math.acos(min(max(0.5 * float(np.vdot(a.rotation, b.rotation)) - 0.5, -1.0), 1.0))
 
 
 #: Deviations are widened by this, because neighboring edges share pixels, and the errors by

@@ -200,13 +200,17 @@ class NeighborFilter:
             self.newest = self.newest._replace(stamp=self.newest.stamp + later)
             self._predicted = self._before = None
 
-    def _transition(self, dt: float) -> tuple[Array, Array, Array]:
+    def _nominal_transition(self, dt: float) -> tuple[Array, Array, Array]:
         dt = round(dt, 6)  # images come at even intervals, to the microsecond or so
         if dt not in self._steps:
             if len(self._steps) > 100:
                 self._steps.clear()
             self._steps[dt] = transition(dt, self.params)
-        linear, whole, noise = self._steps[dt]
+        return self._steps[dt]
+
+    def _transition(self, dt: float) -> tuple[Array, Array, Array]:
+        """Return the transition with the noise of the motion that was learned."""
+        linear, whole, noise = self._nominal_transition(dt)
         x, y, z = self._motion.scale(dt)  # axes are independent of each other
         noise = noise * np.array([x, y, z, x, y, z, *_UNSCALED, x, y, z])
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
@@ -239,7 +243,7 @@ class NeighborFilter:
         if root is not None:
             root = to_body(T_odom_body.rotation.dot(reference)).dot(root) if plausible else (
                 root[:3])
-        self._alike.pass_on(stamp - now.stamp, self._transition(stamp - now.stamp)[1])
+        self._alike.pass_on(stamp - now.stamp, self._nominal_transition(stamp - now.stamp)[1])
         shared = self._alike.together(root)
         across, spread = expected_innovation(prior, jacobian, noise, shared)
 
@@ -358,7 +362,7 @@ class NeighborFilter:
             gain[part] = float(along.dot(across[part])) / whole * along
         remain = _IDENTITY.copy()
         remain[:, POSITION] -= np.outer(gain, along)
-        self._alike.pass_on(stamp - now.stamp, self._transition(stamp - now.stamp)[1])
+        self._alike.pass_on(stamp - now.stamp, self._nominal_transition(stamp - now.stamp)[1])
         self._alike.take(remain, gain, None)
         covariance = remain.dot(prior).dot(remain.T) + (whole - expected_spread) * np.outer(
             gain, gain)

@@ -118,8 +118,8 @@ class Estimate(NamedTuple):
     @property
     def child_acceleration_covariance(self) -> Array:
         """Return the covariance (3, 3) of ``child_acceleration``, without the attitude's share."""
-        own = self.covariance[ACCELERATION, ACCELERATION]
-        covariance: Array = self.rotation.T @ own @ self.rotation
+        covariance: Array = self.rotation.T @ self.covariance[
+            ACCELERATION, ACCELERATION] @ self.rotation
         return covariance
 
     @property
@@ -137,6 +137,8 @@ class Estimate(NamedTuple):
 
 
 _EYE_3 = np.eye(3)
+#: Position, velocity and acceleration among the five parts of the error state.
+_MOTION = np.ix_((0, 1, 4), (0, 1, 4))
 #: Random walk of the ego position without a measured velocity, m/sqrt(s).
 ODOMETRY_WALK = 0.02
 #: Standard deviation of a neighbor's angular velocity before any motion was seen, rad/s.
@@ -213,15 +215,11 @@ def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
     See :func:`motion`; dt is in s.
     """
     linear, jerk = motion(dt, params)
-    whole, noise = np.eye(STATE_SIZE), np.zeros((STATE_SIZE, STATE_SIZE))
-    order = (POSITION, VELOCITY, ACCELERATION)
-    for i, row in enumerate(order):
-        for k, column in enumerate(order):
-            whole[row, column] = linear[i, k] * _EYE_3
-            noise[row, column] = jerk[i, k] * _EYE_3
-    whole[ATTITUDE, RATE] = dt * _EYE_3
-    noise[6:12, 6:12] = np.kron(params.angular_noise**2 * _walk(abs(dt)), _EYE_3)
-    return linear, whole, noise
+    # Along one axis: position, velocity, attitude, rate and acceleration.
+    whole, noise = np.eye(5), np.zeros((5, 5))
+    whole[_MOTION], noise[_MOTION] = linear, jerk
+    whole[2, 3], noise[2:4, 2:4] = dt, params.angular_noise**2 * _walk(abs(dt))
+    return linear, np.kron(whole, _EYE_3), np.kron(noise, _EYE_3)
 
 
 def turned_along(covariance: Array, before: Array, now: Array) -> Array:

@@ -130,7 +130,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     found: EdgeFit | None = None
     whole: _Whole | None = None
     if not smeared:
-        found, sharp = _fit_shown(image, camera, sought.model, expected.pose, spacing)
+        found, sharp, _ = _fit_shown(image, camera, sought.model, expected.pose, spacing)
         if sharp:
             return None
     if found is None:  # it is smeared, or it moved farther than expected
@@ -179,18 +179,20 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
     if whole is not None and whole.fit.blur > EDGELESS:
         return None, whole
     place = starts[0][1].pose if starts else pose
-    found, sharp = _fit_shown(image, camera, sought.model,
-                              place if whole is None else whole.fit.pose, None)
+    found, sharp, plain = _fit_shown(image, camera, sought.model,
+                                     place if whole is None else whole.fit.pose, None)
     if whole is not None and found is None and not sharp:
         # Little smear leaves edges: if they are not there, the attitude may be the mirrored one.
         other = _mirrored_body(sought, whole.number, whole.fit.pose)
         if other is not None:
-            found, sharp = _fit_shown(image, camera, sought.model, other, None)
+            found, sharp, plain = _fit_shown(image, camera, sought.model, other, None)
     if sharp:
         return None, None
-    if found is not None:  # from afar it may have settled early
-        return fit(image, camera, found.lines.model, found.pose, found.spacing) or found, whole
-    return None, whole if smeared else _fit_whole(image, camera, sought, starts)
+    if found is not None:
+        if whole is None or found.blur <= RUN_TOGETHER:  # from afar it may have settled early
+            found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
+        return found, whole
+    return None, whole if smeared or plain else _fit_whole(image, camera, sought, starts)
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,
@@ -282,10 +284,12 @@ class _Shown(NamedTuple):
     A fit to those markers that show their codes, if any.
 
     ``sharp``: whether the edges of a single marker are clear, so that none of it is smeared.
+    ``plain``: whether they are there but not its code, so that something covers it.
     """
 
     fit: EdgeFit | None
     sharp: bool = False
+    plain: bool = False
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
@@ -300,7 +304,8 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if shown is not None and shown.all():
         return _Shown(found)
     if len(seen.codes) == 1:
-        return _Shown(None, found is not None and _sharp(found))
+        return _Shown(None) if found is None else _Shown(
+            None, _sharp(found), found.blur < PLAIN_BLUR)
     if shown is None:  # one that is covered spoils them all
         alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
                  for k in range(len(seen.codes))]
@@ -422,9 +427,12 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
 
 def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
-    lines, codes = found.lines, found.lines.model.codes
-    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code, tracked)
-                     for k, code in enumerate(codes)])
+    lines, model = found.lines, found.lines.model
+    # More edges would be out of place if one of the markers had the code of any other.
+    clear = tracked and found.rms < SHARP_RMS and (
+        (1.0 - found.inlier_share) * len(model) < 0.5 * model.distinct)
+    return np.array([clear or shows_code(image, lines.cells[part], code, tracked)
+                     for part, code in zip(model.cell_slices, model.codes)])
 
 
 def _scale(found: EdgeFit) -> float:

@@ -18,10 +18,10 @@ The print of a marker: its edges for the fit, its cells, and whether an image sh
 Edge points are on the borders between black and white cells, but not near the ends of a straight
 border, where blur rounds the corner.
 
-``shows_code`` makes the final decision on a tracked marker. Light on a marker may be uneven: white
-in a shadow may be darker than black in the sun. In a window of a few cells on one side of the
-shadow's edge, black and white can still be distinguished. So each cell is compared with the cells
-around it, in the window that agrees best with the code.
+``shows_code`` makes the final decision on a tracked marker, unless almost all its edges are in
+place. Light on a marker may be uneven: white in a shadow may be darker than black in the sun. In a
+window of a few cells on one side of the shadow's edge, black and white can still be distinguished.
+So each cell is compared with the cells around it, in the window that agrees best with the code.
 """
 
 from __future__ import annotations
@@ -139,8 +139,9 @@ class CellCode:
     and rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread.
     ``others`` (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells
     that are compared with each other under uneven light. ``beside`` (b, c): 1 for the cells next
-    to an inner cell. ``by_cell`` converts pixels (c, 2) to the distances between cells along rows
-    and columns, px, (2, c).
+    to an inner cell. ``distinct``: the least number of edge points between cells of different
+    colors that are none in another word. ``by_cell`` converts pixels (c, 2) to the distances
+    between cells along rows and columns, px, (2, c).
     """
 
     def __init__(self, marker: Marker, dictionary: str) -> None:
@@ -165,6 +166,12 @@ class CellCode:
             np.ones(len(order) - self.bits.size - self.border, dtype=bool)]))
         apart = np.abs(self.grid[:self.bits.size, None] - self.grid).max(axis=2)
         self.beside: Any = (apart == 1).astype(np.float32)
+        points = np.array([place[:2] for place, *_ in _edges(
+            marker_code(dictionary, marker.marker_id))])
+        beside = np.hypot(points[:, :1] - x, points[:, 1:] - y).argsort(axis=1)[:, :2]
+        differs = np.pad(self.others != self.bits, ((0, 0), (0, 1)))  # the border never does
+        self.distinct = int(differs[:, np.minimum(beside, self.bits.size)].any(axis=2).sum(
+            axis=1).min())
         # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
         self.by_cell = np.linalg.pinv(np.column_stack([self.grid, np.ones(len(self.grid))]))[:2]
 
@@ -303,6 +310,10 @@ class EdgeModel:
         self.shares = np.full(len(self), 1.0 / max(len(self), 1))
         # Where the derivatives of each edge begin, of N_DERIVATIVES each, (n,).
         self.begins = N_DERIVATIVES * np.arange(len(self))
+        self.distinct = min((code.distinct for code in codes), default=0)
+        # The cells of each marker, among all of them.
+        self.cell_slices = [slice(*ends) for ends in pairwise(
+            np.cumsum([0, *(len(code.centers) for code in codes)]).tolist())]
         self._parts: dict[bytes, EdgeModel] = {}
 
     def __len__(self) -> int:

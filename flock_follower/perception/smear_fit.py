@@ -228,12 +228,13 @@ def _basis(pose: Transform, model: SmearModel) -> Array:
 
 def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) -> _Seen | None:
     """Return the brightness at places (3, s) on a marker; None if too few are in the image."""
-    points = places.T.dot(basis.T)
-    if not points[:, 2].min() > _MIN_DEPTH:
+    points = basis.dot(places).T
+    if not np.minimum.reduce(points[:, 2]) > _MIN_DEPTH:
         return None
     pixels = camera.project(points)
-    x, y = pixels.T.copy()
-    left, top, right, bottom = x.min(), y.min(), x.max(), y.max()
+    xy = pixels.T.copy()
+    (left, top), (right, bottom) = (
+        end.reduce(xy, axis=1).tolist() for end in (np.minimum, np.maximum))
     inside: Any = None
     # Written so that NaN is outside.
     if not (left >= 0.0 and top >= 0.0 and right <= camera.width - 1
@@ -365,8 +366,7 @@ def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int)
     """Return the index of the blur of a lens in focus at a pose; one out of focus stays."""
     if lens >= N_FOCUSED:
         return lens
-    depth = float(pose.apply(model.middle[None])[0, 2])
-    blur = _LENS_BLUR * depth / (camera.matrix[0, 0] * model.cell)
+    blur = _LENS_BLUR * pose.apply(model.middle)[2] / (camera.matrix[0, 0] * model.cell)
     return int(np.abs(LENS_BLURS[:N_FOCUSED] - blur).argmin())
 
 
@@ -427,7 +427,7 @@ def _by_pose(basis: Array, places: Array, center: Array, right: Array, down: Arr
     np.negative(down, out=along[1])
     np.multiply(places[0], right, out=along[2])
     along[2] += places[1] * down
-    x, y, z = np.dot(np.linalg.inv(basis).T, along, out=design[:3])
+    x, y, z = np.dot(cv2.invert(basis)[1].T, along, out=design[:3])
     middle = basis.copy()
     middle[:, 2] -= center
     arm_x, arm_y, arm_z = middle.dot(places)
@@ -467,7 +467,7 @@ def _shows_code(model: SmearModel, end: SmearStart, last: _Descent) -> bool:
     # What turning cells adds to the squares left, once the response is fitted anew.
     response, residual = last.response, last.residual
     by_response = turned.dot(response.T)
-    refit = np.linalg.solve(response.dot(response.T) + _RIDGE, by_response.T).T
+    refit = cv2.solve(response.dot(response.T) + _RIDGE, by_response.T)[1].T
     by_residual = turned.dot(residual) - refit.dot(response.dot(residual))
     together = turned.dot(turned.T) - refit.dot(by_response.T)
     if np.count_nonzero(together.diagonal() <= 2.0 * by_residual) > model.errors:

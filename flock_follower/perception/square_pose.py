@@ -28,7 +28,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edges import apply_step, solve_normal
+from flock_follower.perception.edges import apply_step, cross, solve_normal
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import SAME_ATTITUDE
 
@@ -85,11 +85,12 @@ def mirror(pose: Transform, center: Array, facing_along: Array) -> Transform | N
     :param center: of the marker (3,), in the camera's optical frame, m; it does not move.
     :param facing_along: the marker's normal (3,) on the body.
     """
-    normal, sight = pose.rotation @ facing_along, center / np.linalg.norm(center)
-    other = -normal + 2.0 * float(normal @ sight) * sight
-    axis = np.cross(normal, other)
-    sine = float(np.linalg.norm(axis))
+    normal, sight = pose.rotation.dot(facing_along), center / math.sqrt(center.dot(center))
+    other = 2.0 * normal.dot(sight) * sight - normal
+    axis = cross(normal[None], other[None])[0]
+    sine = math.sqrt(axis.dot(axis))
     if sine < SAME_ATTITUDE:
         return None
-    turn = axis / sine * math.atan2(sine, float(normal @ other))
-    return apply_step(pose, center, np.concatenate([np.zeros(3), turn]))
+    step = np.zeros(6)
+    step[3:] = math.atan2(sine, normal.dot(other)) / sine * axis
+    return apply_step(pose, center, step)

@@ -23,7 +23,8 @@ roi      a neighbor not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, a portion in each image
 =======  ==========================================================================
 
-Once a second the whole image is searched even if no neighbor is missing, see ``hypotheses``.
+Once a second the whole image is searched even if no neighbor is missing, see ``hypotheses``: at
+full and at half size in turn.
 """
 
 from __future__ import annotations
@@ -238,8 +239,10 @@ class Tracker:
                 look.others.append(found)
         self._detect(image, look)
         if self._schedule.sweep_due(look.camera, stamp):
-            self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
-            look.camera.swept = stamp
+            self._locate(search.everywhere(
+                image, self.config.dictionary, halved=look.camera.sweeps % 2 > 0),
+                'full', image, look)
+            look.camera.swept, look.camera.sweeps = stamp, look.camera.sweeps + 1
         look.camera.vain.update((name, stamp + look.camera.time_offset.applied)
                                 for name in look.near if name not in look.measured)
         look.sighting.other_ids = sorted(set(look.sighting.other_ids))
@@ -357,9 +360,10 @@ class Tracker:
 
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
         """Return whether a measurement is of a candidate, not of the primary track."""
-        name, place = measurement.name, look.view.T_smooth_camera @ measurement.T_camera_body
-        return self._hypotheses[name].candidate_at(
-            self._time(name, look.camera, look.exposed), place.translation) is not None
+        name, hypotheses = measurement.name, self._hypotheses[measurement.name]
+        return bool(hypotheses.candidates) and hypotheses.candidate_at(
+            self._time(name, look.camera, look.exposed),
+            (look.view.T_smooth_camera @ measurement.T_camera_body).translation) is not None
 
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbors that are not measured yet."""

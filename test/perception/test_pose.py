@@ -24,6 +24,7 @@ import cv2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_images import (
+    Cover,
     DICTIONARY,
     facing,
     known,
@@ -277,6 +278,35 @@ def test_clear_edges_with_hidden_code_do_not_count_as_smear(
     found = known(track(image, SMALL, LEADER, PosePrior(body(marker)), None, True))
     assert found.spacing is not None  # it was there before: its edges are enough
     assert locate(image, SMALL, LEADER, 0, corners, PosePrior(body(marker))) is None
+
+
+def test_edges_all_in_place_show_the_code_of_tracked_marker(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    marker = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05))
+    image = render(SMALL, {0: marker})
+    monkeypatch.setattr(pose_module, 'shows_code', lambda *_: False)
+    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, True) is not None
+    assert locate(image, SMALL, LEADER, 0, corners_of(SMALL, marker), PosePrior()) is None
+
+
+@pytest.mark.parametrize('another', [False, True])
+def test_edges_alike_but_for_two_do_not_show_the_code(another: bool) -> None:
+    # Of all pairs in the dictionary: 39, turned, lacks two of the 52 edge points of 17.
+    marker = facing((0.03, -0.02, 1.0), (0.1, 0.3, 0.05))
+    sought = target(MarkedNeighbor('leader', (Marker(17, SIDE, TAIL),)), DICTIONARY)
+    image = render(SMALL, {17: marker}, codes={
+        17: np.rot90(marker_code(39), 3) if another else marker_code(17)})
+    found = track(image, SMALL, sought, PosePrior(body(marker)), None, True)
+    assert (found is None) == another
+
+
+def test_covered_marker_with_sharp_edges_is_not_fitted_as_smear(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    marker, fits = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05)), list[Any]()
+    image = render(SMALL, {0: marker}, cover=Cover('bottom', 0.4, 110.0), noise=10.0)
+    monkeypatch.setattr(pose_module, 'descend', lambda *start: fits.append(start))
+    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, True) is None
+    assert not fits
 
 
 def test_covariance_covers_both_probable_attitudes() -> None:
