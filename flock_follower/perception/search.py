@@ -103,8 +103,8 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
 
 
 def everywhere(image: GrayImage, dictionary: str, markers: Sequence[Marker] | None = None,
-               border: int = 1, windows: Sequence[tuple[int, int]] = _SEARCH_WINDOWS,
-               halved: bool = False) -> Detections:
+               border: int = 1,
+               windows: Sequence[tuple[int, int]] = _SEARCH_WINDOWS) -> Detections:
     """
     Return the markers in an image.
 
@@ -112,10 +112,9 @@ def everywhere(image: GrayImage, dictionary: str, markers: Sequence[Marker] | No
         dictionary.
     :param border: of a quick search, see ``markers.detect``.
     :param windows: of a thorough search, as _SEARCH_WINDOWS.
-    :param halved: whether to search at half the size, for a third of the time.
     """
     height, width = image.shape
-    scale = (0.5 if width >= LARGE_WIDTH else 1.0) * (0.5 if halved else 1.0)
+    scale = 0.5 if width >= LARGE_WIDTH else 1.0
     return _search(image, (0, 0, width, height), scale, dictionary, markers, border, windows)
 
 
@@ -131,7 +130,9 @@ def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number
         return everywhere(image, dictionary, border=border)
     if number <= len(_SEARCH_WINDOWS):
         return everywhere(image, dictionary, markers, windows=_SEARCH_WINDOWS[number - 1:number])
-    return everywhere(image, dictionary, markers, windows=(_HALVED,), halved=True)
+    height, width = image.shape
+    return _search(image, (0, 0, width, height), 0.25 if width >= LARGE_WIDTH else 0.5, dictionary,
+                   markers, windows=(_HALVED,))
 
 
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,

@@ -221,8 +221,6 @@ class MountedCamera:
         self.time_offset.restart()
         self.searched = self.swept = -math.inf
         """Stamps, s, of the last search for a missing neighbor, and of the last without one."""
-        self.sweeps = 0
-        """Number of searches without a missing neighbor."""
         self.vain: dict[str, float] = {}
         """Time, on the odometry's clock, of the last search without success, s."""
         self.newest = -math.inf

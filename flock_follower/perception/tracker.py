@@ -23,8 +23,7 @@ roi      a neighbor not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, a portion in each image
 =======  ==========================================================================
 
-Once a second the whole image is searched even if no neighbor is missing, see ``hypotheses``: at
-full and at half size in turn.
+Once a second the whole image is searched even if no neighbor is missing, see ``hypotheses``.
 """
 
 from __future__ import annotations
@@ -239,10 +238,8 @@ class Tracker:
                 look.others.append(found)
         self._detect(image, look)
         if self._schedule.sweep_due(look.camera, stamp):
-            self._locate(search.everywhere(
-                image, self.config.dictionary, halved=look.camera.sweeps % 2 > 0),
-                'full', image, look)
-            look.camera.swept, look.camera.sweeps = stamp, look.camera.sweeps + 1
+            self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
+            look.camera.swept = stamp
         look.camera.vain.update((name, stamp + look.camera.time_offset.applied)
                                 for name in look.near if name not in look.measured)
         look.sighting.other_ids = sorted(set(look.sighting.other_ids))

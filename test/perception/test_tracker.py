@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from marker_images import CONFIG, DICTIONARY, facing, Hovering, make_camera, render, SIDE, TAIL
+from marker_images import CONFIG, DICTIONARY, Hovering, make_camera, render, SIDE, TAIL
 import numpy as np
 import pytest
 
@@ -153,16 +153,6 @@ def test_near_search_alternates_with_portions_unless_rare(
     drone = hovering(period=period)
     drone.see(image)
     assert [drone.see(EMPTY).stage for _ in stages] == stages
-
-
-@pytest.mark.parametrize(('side_px', 'found'), [(60.0, [1.0, 2.0, 3.0, 4.0]), (16.0, [1.0, 3.0])])
-def test_further_markers_are_sought_at_half_size_every_2_s(
-        side_px: float, found: list[float]) -> None:
-    drone, depth = hovering(period=0.5), SIDE * CAMERA.matrix[0, 0] / side_px
-    image = render(CAMERA, {0: (OWN @ MOUNTING).inverse() @ LEADER @ TAIL,
-                            7: facing((-0.3 * depth, 0.0, depth), (0.1, 0.3, 0.05))}, rays=3)
-    drone.see(image)
-    assert [0.5 * k for k in range(1, 9) if drone.see(image).other_ids == [7]] == found
 
 
 @pytest.mark.parametrize(('rate', 'every', 'most'), [(60.0, 2, 1), (30.0, 1, 1), (7.0, 1, 4)])
