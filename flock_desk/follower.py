@@ -361,16 +361,20 @@ class Follower:
 
     def _run_until(self, time: int) -> None:
         while True:
-            times = [self._wait_end(), self._silence, self._next_tick, self._next_cycle]
-            next_time = min(each for each in times if each is not None)
+            waited, silence = self._wait_end(), self._silence
+            next_time = min(self._next_tick, self._next_cycle)
+            if waited is not None and waited < next_time:
+                next_time = waited
+            if silence is not None and silence < next_time:
+                next_time = silence
             if next_time > time:
                 return
             self._now = max(self._now, next_time)
-            if next_time == times[0]:
+            if next_time == waited:
                 self._process_due()
                 if self._wait_end() == next_time:  # seconds are rounded: long after the start
                     self._now += _ROUNDING
-            elif next_time == times[1]:
+            elif next_time == silence:
                 self._silence = None
                 self._tick()
             elif next_time == self._next_tick:

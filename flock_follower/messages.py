@@ -164,7 +164,8 @@ class OdometryState(NamedTuple):
     @property
     def velocity_covariance(self) -> Array:
         """Return the covariance (3, 3) of the velocity in the header's frame."""
-        turned: Array = self.twist_rotation @ self.twist_covariance[:3, :3] @ self.twist_rotation.T
+        turned: Array = self.twist_rotation.dot(self.twist_covariance[:3, :3]).dot(
+            self.twist_rotation.T)
         return turned
 
 
@@ -213,7 +214,7 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
             raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
     rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
     return OdometryState(
-        stamp, message.header.frame_id, message.child_frame_id, position, q, rotation @ linear,
+        stamp, message.header.frame_id, message.child_frame_id, position, q, rotation.dot(linear),
         angular, np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
         np.asarray(message.twist.covariance, dtype=float).reshape(6, 6), rotation)
 

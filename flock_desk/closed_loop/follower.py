@@ -65,6 +65,7 @@ from flock_follower.planner.step import Decision
 
 _TICK_DELAY_NS = 1  # ns by which ticks come after the messages of their moment
 
+_HERE = Transform()
 _ZERO_VECTOR = np.zeros(3)
 _LEVEL_ATTITUDE = np.eye(3)
 _NO_COVARIANCE = np.zeros((6, 6))
@@ -145,7 +146,7 @@ class SimulatedFollower(Listener):
                        _NO_COVARIANCE) if self._alone else _covariances(self._errors, now)
         self._follower.odometry(to_nanoseconds(now), OdometryState(
             to_nanoseconds(own.stamp), self._frame, 'base_link', to_odom.apply(own.position),
-            quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation @ own.velocity,
+            quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation.dot(own.velocity),
             _ZERO_VECTOR,
             pose, twist, _LEVEL_ATTITUDE))
 
@@ -171,17 +172,17 @@ class SimulatedFollower(Listener):
 
     def _see(self, now: float, sighted: Sighted) -> None:
         name, n, yaw, relative = sighted
-        to_frame = Transform() if relative else self._T_odom_world
+        to_frame, turn = (_HERE, 0.0) if relative else (self._T_odom_world, self._turn)
         axes, pose, twist = to_frame.rotation, np.zeros((6, 6)), np.zeros((6, 6))
-        pose[:3, :3] = axes @ n.covariance[POSITION, POSITION] @ axes.T
-        twist[:3, :3] = axes @ n.covariance[VELOCITY, VELOCITY] @ axes.T
+        pose[:3, :3] = axes.dot(n.covariance[POSITION, POSITION]).dot(axes.T)
+        twist[:3, :3] = axes.dot(n.covariance[VELOCITY, VELOCITY]).dot(axes.T)
         pose[5, 5] = _ANY_YAW if yaw is None else YAW_NOISE ** 2 + MARKER_TILT ** 2
-        quaternion = quaternion_from_yaw((yaw or 0.0) + yaw_from_quaternion(to_frame.quaternion))
-        acceleration = quaternion_to_matrix(quaternion).T @ (axes @ n.acceleration)
+        quaternion = quaternion_from_yaw((yaw or 0.0) + turn)
+        acceleration = quaternion_to_matrix(quaternion).T.dot(axes.dot(n.acceleration))
         stamp = to_nanoseconds(n.stamp)
         self._follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
             stamp, RELATIVE if relative else self._frame, name, to_frame.apply(n.position),
-            quaternion, axes @ n.velocity, _ZERO_VECTOR, pose, twist, _LEVEL_ATTITUDE),
+            quaternion, axes.dot(n.velocity), _ZERO_VECTOR, pose, twist, _LEVEL_ATTITUDE),
             AccelerationState(stamp, name, acceleration)))
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
@@ -192,7 +193,7 @@ class SimulatedFollower(Listener):
         :param altitude: by its barometer, m.
         """
         time, self._now = to_nanoseconds(now), now
-        self._follower.estimate(time, self._T_odom_world.rotation @ estimate)
+        self._follower.estimate(time, self._T_odom_world.rotation.dot(estimate))
         self._follower.height(time, altitude, float(position[2]))
         self._follower.advance(time + _TICK_DELAY_NS)
         for event in [each for each in self._waiting if each[0] <= now + 1e-9]:
@@ -276,7 +277,7 @@ class SimulatedFollower(Listener):
         setpoint = cycle.setpoint
         if setpoint.kind != NONE:
             self._setpoint, self._setpoint_time = setpoint._replace(
-                acceleration=self._T_odom_world.rotation.T @ setpoint.acceleration,
+                acceleration=self._T_odom_world.rotation.T.dot(setpoint.acceleration),
                 yaw=None if setpoint.yaw is None else setpoint.yaw - self._turn), self._now
             self.unasked += not self._asked
 

@@ -111,16 +111,16 @@ class MotionSources:
         if v is None:
             return 'not finite' if finite_vector(report.velocity) is None else 'too fast'
         if not (refused := refusal(age, max_age)):
-            by, before = self.source, self.position
+            by, before = self.source, self._sources[self.source].path.position
             time = now - max(age, 0.0)
             known.take_velocity(v, time)
             known.take_yaw(report.yaw, time)
             known.take_position(report.position, time, report.std, max_age, (
                 self._displacement_in_gap(report.yaw, time) if source == ODOM else None))
-            now_at = self.position
-            if by != self.source and before is not None and now_at is not None:
+            now_at = self.position if by != self.source else None
+            if before is not None and now_at is not None:
                 # Odometry takes over, in a frame of its own: the vehicle has not moved by that.
-                self._handed_on = before - now_at
+                self._handed_on = before + self._handed_on - now_at
         return refused
 
     def _displacement_in_gap(self, yaw: float, time: float) -> Array | None:
@@ -131,8 +131,10 @@ class MotionSources:
         :returns: None without a gap, or if the displacement or the turn of the frames is unknown.
         """
         autopilot, begun = self._sources[AUTOPILOT], self._sources[ODOM].path.time
+        if not time - begun > PATH_GAP:  # most often
+            return None
         (first, last), (other_yaw, known_at) = autopilot.path.span, autopilot.yaw(time)
-        if not (time - begun > PATH_GAP >= time - min(last, known_at) and first <= begun and (
+        if not (time - min(last, known_at) <= PATH_GAP and first <= begun and (
                 math.isfinite(yaw))):
             return None
         return rotate_about_vertical(

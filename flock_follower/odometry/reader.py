@@ -291,7 +291,7 @@ class OdometrySource:
                 self._fading = None if self._reading == NONE and (
                     self.twist.failing or self.twist.contradiction) else (
                         left + self._as_read(before, time, child, odom)) - velocity
-        if self._fading is not None and self._fading.any():
+        if self._fading is not None and np.count_nonzero(self._fading):
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading
         return velocity
@@ -323,7 +323,7 @@ class OdometrySource:
         wrong = 0.0 if self._reading == NONE else self.twist.wrong_probability
         for share, off in ((wrong, self._doubt), (1.0, self._fading)):
             # The velocity may be the other reading, and a step being faded out is an error.
-            if share and off is not None and off.any():
+            if share and off is not None and np.count_nonzero(off):
                 in_base = rotation.T.dot(off)
                 twist = twist.copy()
                 twist[:3, :3] += share * (in_base[:, None] * in_base)
@@ -364,7 +364,8 @@ class OdometrySource:
 def _is_correlated(matrix: Array) -> bool:
     """Return whether no correlation in a matrix (n, n) exceeds 1: else it is no covariance."""
     variances = matrix.diagonal()
-    return bool((matrix * matrix <= MAX_CORRELATION**2 * variances[:, None] * variances).all())
+    return matrix.size == np.count_nonzero(
+        matrix * matrix <= MAX_CORRELATION**2 * variances[:, None] * variances)
 
 
 def read_odometry(data: bytes) -> Any:

@@ -243,7 +243,8 @@ class NeighborFilter:
         if root is not None:
             root = to_body(T_odom_body.rotation.dot(reference)).dot(root) if plausible else (
                 root[:3])
-        self._alike.pass_on(stamp - now.stamp, self._nominal_transition(stamp - now.stamp)[1])
+        self._alike.pass_on(stamp - now.stamp, _IDENTITY if self._alike.cross is None else (
+            self._nominal_transition(stamp - now.stamp)[1]))
         shared = self._alike.together(root)
         across, spread = expected_innovation(prior, jacobian, noise, shared)
 

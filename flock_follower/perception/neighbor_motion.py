@@ -102,24 +102,24 @@ class Estimate(NamedTuple):
     @property
     def pose_covariance(self) -> Array:
         """Return the covariance (6, 6) of position and rotation about odom's axes (REP-103)."""
-        return POSE @ self.covariance @ POSE.T
+        return POSE.dot(self.covariance).dot(POSE.T)
 
     @property
     def child_twist(self) -> Array:
         """Return linear and angular velocity (6,) in the neighbor's body frame (REP-105)."""
-        return np.concatenate([self.rotation.T @ self.velocity,
-                               self.rotation.T @ self.angular_velocity])
+        return np.concatenate([self.rotation.T.dot(self.velocity),
+                               self.rotation.T.dot(self.angular_velocity)])
 
     @property
     def child_acceleration(self) -> Array:
         """Return the acceleration (3,) in the neighbor's body frame."""
-        return self.rotation.T @ self.acceleration
+        return self.rotation.T.dot(self.acceleration)
 
     @property
     def child_acceleration_covariance(self) -> Array:
         """Return the covariance (3, 3) of ``child_acceleration``, without the attitude's share."""
-        covariance: Array = self.rotation.T @ self.covariance[
-            ACCELERATION, ACCELERATION] @ self.rotation
+        own = self.covariance[ACCELERATION, ACCELERATION]
+        covariance: Array = self.rotation.T.dot(own).dot(self.rotation)
         return covariance
 
     @property
@@ -132,8 +132,8 @@ class Estimate(NamedTuple):
         jacobian[3:, ATTITUDE] = skew(self.angular_velocity)
         to_child = np.zeros((6, 6))
         to_child[:3, :3] = to_child[3:, 3:] = self.rotation.T
-        jacobian = to_child @ jacobian
-        return jacobian @ self.covariance @ jacobian.T
+        jacobian = to_child.dot(jacobian)
+        return jacobian.dot(self.covariance).dot(jacobian.T)
 
 
 _EYE_3 = np.eye(3)

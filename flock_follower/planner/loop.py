@@ -229,7 +229,7 @@ class PlannerLoop:
         waiting = self.waiting_reason(bridge_age) if self.engaged else self._disengaged_by
         self.memory, decision = step(self.memory, Inputs(
             now, self.engaged, own, neighbors, looked, waiting, self.view, self.ground,
-            [self.seconds(stamp) for stamp in self._frames]), params)
+            [(stamp - self._epoch) * 1e-9 for stamp in self._frames]), params)
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None  # it is of another frame
         if decision.acceleration is None or decision.yaw is None:
