@@ -29,6 +29,7 @@ from flock_follower.gate.permission import (
     Permission,
     Phase,
     STICK,
+    Taker,
 )
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.mavlink import takeover
@@ -44,6 +45,7 @@ ENDED = 'end', 'hold requested'
 MOVED = 'end', STICK.text, Cause.STICK
 REBOOTED = 'reset', 'the autopilot rebooted'
 SECOND = 'contest', '/planner, /other'
+SILENT = 'fall_silent', 'no velocity', 0.1  # since the last message with the mode, s
 LANDED = 'land',
 GROUND = 'on the ground'
 
@@ -99,7 +101,8 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
             f'the pilot, or a failsafe, took over {seconds} s ago')
         assert permission.name_taker(STICK, now).taken_over(now).startswith('the pilot took over')
         assert not permission.name_taker(STICK, now).taken_over(15.0)  # 10 s from the takeover
-    assert permission.taken_over(14.9)
+    other = permission.name_taker(Taker('another pilot', True), 5.0)
+    assert permission.taken_over(14.9) and other.taken_over(5.0).startswith('the pilot took over')
     failed = permission.name_taker(takeover.failsafe('fence'), 6.0)
     assert not failed.taken_over(6.0)
     assert failed.announcement() == 'TAKEN_OVER: offboard was left for POSCTL: failsafe: fence'
@@ -114,8 +117,8 @@ def test_a_stick_takes_over_no_flight_that_none_took(events):
 
 
 @pytest.mark.parametrize('events', [
-    (), (ENDED,), (('end', 'low battery'), seen(PILOT, 5.0)), (('fall_silent', 'no velocity'),),
-    (ENDED, ('fall_silent', 'no velocity')), (LANDED,), (seen(DISARMED, 5.0),)])
+    (), (ENDED,), (('end', 'low battery'), seen(PILOT, 5.0)), (SILENT,),
+    (ENDED, SILENT), (LANDED,), (seen(DISARMED, 5.0),)])
 def test_nothing_but_a_request_undoes_a_moved_stick(events):
     permission = after(ASKED, seen(OURS, 5.0), MOVED, *events)
     assert permission.taken_over(14.9).startswith('the pilot took over')
@@ -123,8 +126,13 @@ def test_nothing_but_a_request_undoes_a_moved_stick(events):
     assert not next_permission(permission, ('request', 15.0)).taken_over(15.0)
 
 
+def test_a_mode_left_after_a_moved_stick_is_a_takeover():
+    assert after(ASKED, seen(OURS), MOVED, seen(PILOT, 5.0)).announcement() == (
+        'TAKEN_OVER: offboard was left for POSCTL: the pilot moved a stick')
+
+
 @pytest.mark.parametrize('ended', [
-    (('fall_silent', 'no velocity'),), (ENDED, seen(HOLD, 5.0))])
+    (SILENT,), (ENDED, seen(HOLD, 5.0))])
 def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
     permission = after(ASKED, seen(OURS, 5.0), *ended, MOVED)
     assert permission.phase is Phase.INACTIVE
@@ -132,11 +140,11 @@ def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
     assert not permission.taken_over(15.0) and after(MOVED) == Permission()
 
 
-UNSEEN = ('fall_silent', 'no velocity', 3.1)  # without a mode for so long, s
+UNSEEN = 'fall_silent', 'no velocity', 3.1
 
 
 @pytest.mark.parametrize('events', [
-    (UNSEEN,), (('follow_silence', 5.1), ('fall_silent', 'no velocity')), (UNSEEN, ENDED)])
+    (UNSEEN,), (('follow_silence', 5.1), SILENT), (UNSEEN, ENDED)])
 def test_silence_hides_no_switch_that_was_not_seen(events):
     silent = after(ASKED, seen(OURS), *events)
     assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
@@ -147,8 +155,8 @@ def test_silence_hides_no_switch_that_was_not_seen(events):
     assert not landed.taken_over(20.0)
     assert next_permission(landed, seen(PILOT, 21.0)) is landed
     # Nothing is hidden if the mode was known, or had not been there yet.
-    for known in (after(ASKED, seen(OURS), ('fall_silent', 'no velocity', 3.0)),
-                  after(ASKED, UNSEEN)):
+    for known in (after(ASKED, seen(OURS), SILENT), after(ASKED, UNSEEN),
+                  after(ASKED, seen(OURS), ('fall_silent', 'no velocity', 3.0))):
         assert next_permission(known, seen(PILOT, 20.0)) is known
 
 
@@ -182,11 +190,11 @@ def test_a_heartbeat_from_before_the_request_has_no_effect(received):
 
 def test_refused_request_ends_and_stream_without_velocity_stops():
     assert after(ASKED, ('fail', 'refused')).announcement() == 'INACTIVE: refused'
-    silent = after(ASKED, seen(OURS), ('fall_silent', 'no velocity'))
+    silent = after(ASKED, seen(OURS), SILENT)
     assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
     for idle in (after(), after(ASKED, seen(OURS), seen(PILOT))):
         assert next_permission(idle, ('fail', 'refused')) is idle
-        assert next_permission(idle, ('fall_silent', 'no velocity')) is idle
+        assert next_permission(idle, SILENT) is idle
 
 
 def test_late_refusal_ends_nothing_that_vehicle_already_obeys():
@@ -244,7 +252,7 @@ def test_long_silence_may_hide_a_takeover_and_return():
 
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [('request', 1.0), ('follow_silence', 5.1), ('fall_silent', 'no velocity'), UNSEEN,
+EVENTS = [('request', 1.0), ('follow_silence', 5.1), SILENT, UNSEEN,
           ('fail', 'late'), LANDED, ENDED, MOVED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]
