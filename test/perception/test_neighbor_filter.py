@@ -364,6 +364,20 @@ def test_second_surprising_attitude_counts_on_the_same_side_only() -> None:
     assert shares[0] > 1.5 * shares[1] > 0.0
 
 
+def test_a_first_surprising_attitude_weighs_as_one_on_the_gate() -> None:
+    turns = []
+    for off in (0.999, 4.0):
+        tracker, t = NeighborFilter(), 31 * DT
+        for k in range(31):  # without a lever no position depends on the attitude
+            tracker.update(k * DT, truth(k * DT), np.zeros(3), NOISE)
+        before = now(tracker, t)
+        angle = math.sqrt(off * GATE_CHI2 * (before.covariance[8, 8] + NOISE[5, 5]))
+        turn = rotation_vector_to_matrix([0.0, 0.0, angle])
+        tracker.update(t, Transform(turn @ before.rotation, before.position), np.zeros(3), NOISE)
+        turns.append(matrix_to_rotation_vector(now(tracker, t).rotation @ before.rotation.T)[2])
+    assert turns[1] == pytest.approx(0.5 * turns[0], rel=2e-3) and turns[0] > 0.005
+
+
 @pytest.mark.parametrize(('angle', 'outcome'), [
     (0.29, UpdateOutcome.USED), (0.31, UpdateOutcome.POSITION_ONLY)])
 def test_attitude_outside_the_gate_is_mirrored_from_0_3_rad(
