@@ -299,38 +299,52 @@ def test_twist_covariance_is_that_of_perturbed_states() -> None:
     assert ratios.max() < 1.1
 
 
-def gated(off: float) -> tuple[NeighborFilter, UpdateOutcome, Array, float]:
+def gated(off: float, tracker: NeighborFilter | None = None,
+          t: float = 1.0 + DT) -> tuple[UpdateOutcome, Array, float]:
     """
     Return what a measurement sideways does whose chi^2 is ``off`` times the gate's.
 
-    These are the filter, the outcome, how far it moves the state, and the way measured, m.
+    These are the outcome, how far it moves the state, and the way measured, m. A negative ``off``
+    is the same on the other side.
     """
-    tracker, t = tracked(1.0), 1.0 + DT
+    tracker = tracker or tracked(1.0)
     before = now(tracker, t)
     # The position of the body: the lever adds the noise of the attitude.
     lever = to_body(before.rotation @ TAIL)
     spread = before.covariance[:3, :3] + (lever @ NOISE @ lever.T)[:3, :3]
     way = np.array([0.0, 1.0, 0.0])
-    way *= math.sqrt(off * GATE_CHI2 / (way @ np.linalg.solve(spread, way)))
+    way *= math.copysign(
+        math.sqrt(abs(off) * GATE_CHI2 / (way @ np.linalg.solve(spread, way))), off)
     there = Transform(before.rotation, before.position + way)
     outcome = update(tracker, t, there)
-    return tracker, outcome, now(tracker, t).position - before.position, float(way[1])
+    return outcome, now(tracker, t).position - before.position, float(way[1])
 
 
 @pytest.mark.parametrize(('off', 'outcome'), [
     (0.999, UpdateOutcome.USED), (1.001, UpdateOutcome.SURPRISING),
     (9.999, UpdateOutcome.SURPRISING), (10.001, UpdateOutcome.OUTLIER)])
 def test_the_gate_is_one_chi2_and_refuses_ten(off: float, outcome: UpdateOutcome) -> None:
-    assert gated(off)[1] is outcome
+    assert gated(off)[0] is outcome
 
 
 def test_a_first_surprise_weighs_as_much_as_one_on_the_gate() -> None:
-    _, _, on_gate, way = gated(1.0)
+    _, on_gate, way = gated(1.0)
     for off in (2.0, 4.0, 9.0):
-        _, _, moved_by, farther = gated(off)
+        _, moved_by, farther = gated(off)
         assert farther == pytest.approx(math.sqrt(off) * way)
         # The weight falls with the square of the way: so does the move with the way.
         np.testing.assert_allclose(moved_by, on_gate / math.sqrt(off), rtol=1e-6)
+
+
+@pytest.mark.parametrize('off', [1.2, 5.0])
+def test_any_second_surprise_on_the_same_side_weighs_more(off: float) -> None:
+    shares = []
+    for side in (1.0, -1.0):
+        tracker = tracked(1.0)
+        gated(off, tracker)
+        _, moved_by, way = gated(side * off, tracker, 1.0 + 2.0 * DT)
+        shares.append(float(moved_by[1]) / way)
+    assert shares[0] > 1.15 * shares[1] > 0.0
 
 
 def test_what_holds_nan_is_refused_and_changes_nothing() -> None:
