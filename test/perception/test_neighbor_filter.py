@@ -241,6 +241,15 @@ def test_errors_alike_between_images_do_not_average_out(
     assert least < np.mean(squares) < most
 
 
+def test_alike_errors_of_a_mirrored_attitude_are_of_the_place() -> None:
+    tracker, alike = NeighborFilter(), 0.8 * NOISE
+    for k in range(10):
+        tracker.update(k * DT, measured(truth(k * DT)), TAIL, NOISE, alike=alike)
+    body = mirrored(measured(truth(10 * DT)))
+    assert tracker.update(10 * DT, body, TAIL, NOISE, alike=alike) is UpdateOutcome.POSITION_ONLY
+    np.linalg.cholesky(known(tracker.newest).covariance)
+
+
 def test_alike_errors_are_forgotten_once_measurements_have_none() -> None:
     with_some, without = NeighborFilter(), NeighborFilter()
     for k in range(90):
