@@ -274,6 +274,13 @@ def test_a_contradicted_attitude_is_dropped_within_0_3_s(rate: float, images: in
     assert (images - 1) * period < 0.3
 
 
+def test_a_new_track_drops_its_attitude_as_soon_as_an_old_one() -> None:
+    tracker, period = NeighborFilter(), 1.0 / 15.0
+    update(tracker, 0.0, mirrored(truth(0.0)))
+    outcomes = [update(tracker, k * period, truth(k * period)) for k in range(1, 5)]
+    assert outcomes == [UpdateOutcome.POSITION_ONLY] * 3 + [UpdateOutcome.STARTED]
+
+
 @pytest.mark.parametrize(('t', 'outcome'), [
     (1.9, UpdateOutcome.OLDER), (2.0, UpdateOutcome.OLDER), (3.0, UpdateOutcome.USED),
     (4.5, UpdateOutcome.STARTED), (0.1, UpdateOutcome.STARTED)])  # a gap; a jump back in time
@@ -308,8 +315,8 @@ def test_twist_covariance_is_that_of_perturbed_states() -> None:
     assert ratios.max() < 1.1
 
 
-def gated(off: float, tracker: NeighborFilter | None = None,
-          t: float = 1.0 + DT) -> tuple[UpdateOutcome, Array, float]:
+def gated(off: float, tracker: NeighborFilter | None = None, t: float = 1.0 + DT,
+          reach: float = math.inf) -> tuple[UpdateOutcome, Array, float]:
     """
     Return what a measurement sideways does whose chi^2 is ``off`` times the gate's.
 
@@ -325,7 +332,7 @@ def gated(off: float, tracker: NeighborFilter | None = None,
     way *= math.copysign(
         math.sqrt(abs(off) * GATE_CHI2 / (way @ np.linalg.solve(spread, way))), off)
     there = Transform(before.rotation, before.position + way)
-    outcome = update(tracker, t, there)
+    outcome = tracker.update(t, there, TAIL, NOISE, reach)
     return outcome, now(tracker, t).position - before.position, float(way[1])
 
 
@@ -334,6 +341,32 @@ def gated(off: float, tracker: NeighborFilter | None = None,
     (9.999, UpdateOutcome.SURPRISING), (10.001, UpdateOutcome.OUTLIER)])
 def test_the_gate_is_one_chi2_and_refuses_ten(off: float, outcome: UpdateOutcome) -> None:
     assert gated(off)[0] is outcome
+
+
+@pytest.mark.parametrize(('off', 'outcome'), [
+    (0.999, UpdateOutcome.USED), (1.001, UpdateOutcome.OUTLIER)])
+def test_reach_bounds_only_what_is_outside_the_gate(off: float, outcome: UpdateOutcome) -> None:
+    assert gated(off, reach=0.0)[0] is outcome
+
+
+def test_the_gate_holds_999_of_1000_good_measurements() -> None:
+    # The distribution of chi^2 with 3 degrees of freedom.
+    share = math.erf(math.sqrt(0.5 * GATE_CHI2)) - math.sqrt(
+        2.0 * GATE_CHI2 / math.pi) * math.exp(-0.5 * GATE_CHI2)
+    assert share == pytest.approx(0.999, abs=1e-5)
+
+
+@pytest.mark.parametrize('off', [0.5, 1.5, 6.0])
+def test_a_surprise_leaves_the_covariance_of_its_weight(off: float) -> None:
+    tracker, t = tracked(1.0), 1.0 + DT
+    before = now(tracker, t)
+    gated(off, tracker, t)
+    lever = to_body(before.rotation @ TAIL)
+    spread = max(off, 1.0) * (before.pose_covariance + lever @ NOISE @ lever.T)
+    across = before.covariance[np.r_[0:3, 6:9]]
+    np.testing.assert_allclose(
+        now(tracker, t).covariance,
+        before.covariance - across.T @ np.linalg.solve(spread, across), rtol=1e-5, atol=1e-10)
 
 
 def test_a_first_surprise_weighs_as_much_as_one_on_the_gate() -> None:
