@@ -36,6 +36,7 @@ from flock_follower.bridge_state import FLYING, read_flag
 from flock_follower.check import LISTENING_TIME, table
 from flock_follower.checks.findings import ready
 from flock_follower.checks.recorded_system import judge_all
+from flock_follower.signals import show_error
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -54,8 +55,7 @@ def main(args: Sequence[str] | None = None) -> int:
         from flock_follower.nodes.observer import observe
         from flock_follower.nodes.pilot import fly
     except ModuleNotFoundError as error:
-        print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
-              'package in package.xml', file=sys.stderr)
+        show_error(ModuleNotFoundError, error, None)
         return 2
     try:
         seen = observe(LISTENING_TIME, options.namespace, {}, '')

@@ -63,7 +63,8 @@ def _runs_as_a_program() -> bool:
             or Path(__file__).with_name('nodes').joinpath(f'{path.name}.py').exists())
 
 
-def _show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def show_error(kind: type[BaseException], error: BaseException,
+               trace: TracebackType | None) -> None:
     """Show what ends a program: nothing for Ctrl-C, one line for a package that is missing."""
     if isinstance(error, ModuleNotFoundError):
         print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
@@ -74,4 +75,4 @@ def _show(kind: type[BaseException], error: BaseException, trace: TracebackType 
 
 AS_A_PROGRAM = _runs_as_a_program()
 if AS_A_PROGRAM:
-    sys.excepthook = _show
+    sys.excepthook = show_error

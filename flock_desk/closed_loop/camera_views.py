@@ -316,8 +316,7 @@ def _random_draws(scenario: Scenario, run: int, number: int) -> tuple[Array, Arr
     for outage in scenario.outages:
         if outage.what == 'marker':
             clear &= (times < outage.at) | (times >= outage.at + outage.duration)
-    for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
-            sensing.light_changes * scenario.duration / 60.0)):
+    for begin in sensing.draw_light_changes(scenario.duration, rng):
         clear &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
     noise = [rng.standard_normal((count, 6))]
     for other in range(2, scenario.company.followers + 1):

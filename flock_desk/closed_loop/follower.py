@@ -302,6 +302,4 @@ def _covariances(errors: VioErrors, time: float) -> tuple[Array, Array]:
     pose = np.diag([*(errors.position ** 2 + time * walks ** 2),
                     *[errors.tilt ** 2 + errors.tilt_bias ** 2] * 2,
                     errors.attitude ** 2 + time * errors.yaw_walk ** 2])
-    twist = np.diag([errors.velocity ** 2 + errors.velocity_white ** 2] * 3
-                    + [errors.gyro_bias ** 2 + errors.gyro ** 2] * 3)
-    return pose, twist
+    return pose, errors.twist_covariance

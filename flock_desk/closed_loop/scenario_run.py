@@ -61,8 +61,7 @@ class ScenarioRun:
         self._latency_rng = scenario.random(run, 'images')
         self._latency = self._latency_rng.uniform(*scenario.sensing.latency)
         rng, sensing = scenario.random(run, 'light'), scenario.sensing
-        begins = rng.uniform(0.0, scenario.duration,
-                             rng.poisson(sensing.light_changes * scenario.duration / 60.0))
+        begins = sensing.draw_light_changes(scenario.duration, rng)
         self.light_changes = [(begin, begin + float(rng.uniform(*sensing.light_change)))
                               for begin in np.sort(begins).tolist()]
         """Begin and end of each, s."""

@@ -232,7 +232,7 @@ def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None],
 
 def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
                      exit_codes: Mapping[str, int | None], load: Load | None = None,
-                     speed: float | None = 1.0) -> dict[str, Any]:
+                     speed: float | None = None) -> dict[str, Any]:
     """
     Return the summary of ``fly``.
 

@@ -28,6 +28,7 @@ import numpy as np
 
 from flock_desk.scenarios.flock import Flock, Part
 from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array
 from flock_follower.planner.params import COLUMN_V_MAX, PlannerParams
 from flock_follower.ranges import parameter, Range
 from flock_follower.settings import refuse
@@ -172,6 +173,10 @@ class Sensing(Part):
         (0.1, 0.4), Range(0.01, 60.0, 's'),
         'Duration of each such change of light, s; each draws one.')
 
+    def draw_light_changes(self, duration: float, rng: np.random.Generator) -> Array:
+        """Return the times, s, at which the light changes in a flight of a duration, s."""
+        return rng.uniform(0.0, duration, rng.poisson(self.light_changes * duration / 60.0))
+
 
 @dataclass(frozen=True)
 class VioErrors(Part):
@@ -213,6 +218,12 @@ class VioErrors(Part):
         0.002, Range(0.0, 1.0, 'rad/s'), 'Remaining bias of the gyroscopes, rad/s, constant.')
     gyro: float = parameter(
         0.006, Range(0.0, 1.0, 'rad/s'), 'White noise of the gyroscopes, rad/s.')
+
+    @property
+    def twist_covariance(self) -> Array:
+        """Return the covariance (6, 6) of velocity, m/s, and angular velocity, rad/s."""
+        return np.diag([self.velocity ** 2 + self.velocity_white ** 2] * 3
+                       + [self.gyro_bias ** 2 + self.gyro ** 2] * 3)
 
 
 @dataclass(frozen=True)

@@ -142,8 +142,7 @@ class VioEstimator:
                                   else np.zeros(2))
         self._keep = float(np.exp(-period / errors.tilt_memory))
         self._bias = errors.gyro_bias * rng.standard_normal(3)
-        self._twist_covariance = np.diag([errors.velocity ** 2 + errors.velocity_white ** 2] * 3
-                                         + [errors.gyro_bias ** 2 + errors.gyro ** 2] * 3)
+        self._twist_covariance = errors.twist_covariance
         self._position = start.position
         self.estimate = self._reported(start)
         """The newest odometry."""

@@ -33,12 +33,7 @@ from flock_follower.checks.observations import (
 )
 from flock_follower.checks.pictures import camera_model
 from flock_follower.checks.pose_topics import Arrival, judge_poses
-from flock_follower.geometry import (
-    Array,
-    quaternion_from_rpy,
-    quaternion_to_matrix,
-    R_FLU_OPTICAL,
-)
+from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds, to_nanoseconds
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, SourceParams
@@ -268,9 +263,7 @@ def _upwards(seen: Observations, path: OwnPath | None, stamp: float) -> Array | 
     if path is None:
         return None
     quaternions, known = path.attitude(np.array([stamp]))
-    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
-    R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
-    up: Array = (quaternion_to_matrix(quaternions[0]) @ R_base_optical)[2]
+    up: Array = (quaternion_to_matrix(quaternions[0]) @ seen.camera_rotation)[2]
     return up if known[0] else None
 
 

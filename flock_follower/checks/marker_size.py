@@ -42,12 +42,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.image_motion import OwnPath
 from flock_follower.checks.observations import Observations
-from flock_follower.geometry import (
-    Array,
-    quaternion_from_rpy,
-    quaternion_to_matrix,
-    R_FLU_OPTICAL,
-)
+from flock_follower.geometry import Array, quaternion_to_matrix
 
 #: Least number of sightings.
 MIN_SIGHTINGS = 12
@@ -94,10 +89,8 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
     rows = np.array(sorted(row for row in seen.sightings if row[1] == number))
     quaternions, known = path.attitude(rows[:, 0])
     rotations = np.array([quaternion_to_matrix(q) for q in quaternions[known]])
-    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
-    R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
     found = distance_ratio(
-        rows[known, 2:] @ R_base_optical.T, path.motion(rows[known, 0])[0], rotations,
+        rows[known, 2:] @ seen.camera_rotation.T, path.motion(rows[known, 0])[0], rotations,
         np.array(seen.value('relative_pose', 'camera_position', [0.0, 0.0, 0.0])))
     if (found is None or not found.at_rest
             or SIGNIFICANT_SIGMAS * found.deviation > 3.0 * SIZE_WARNING):

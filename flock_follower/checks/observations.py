@@ -29,6 +29,12 @@ import numpy as np
 from flock_follower.checks.pose_path import PosePath
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    R_FLU_OPTICAL,
+)
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.odometry.static_frames import StaticFrames
@@ -37,7 +43,6 @@ from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 
 
-#: The nodes of a follower.
 class TopicEnd(NamedTuple):
     """A publisher of a topic; ``node`` is '' if unknown, as in bags."""
 
@@ -251,3 +256,13 @@ class Observations:
     def value(self, node: str, parameter: str, default: Any = None) -> Any:
         """Return the value of a parameter of one of our nodes."""
         return self.parameters.get(node, {}).get(parameter, default)
+
+    @property
+    def camera_rpy(self) -> Any:
+        """Return the configured roll, pitch and yaw of the camera on base_link, rad."""
+        return self.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
+
+    @property
+    def camera_rotation(self) -> Array:
+        """Return the configured rotation (3, 3) from the camera's optical frame to base_link."""
+        return quaternion_to_matrix(quaternion_from_rpy(*self.camera_rpy)) @ R_FLU_OPTICAL

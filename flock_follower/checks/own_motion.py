@@ -41,7 +41,6 @@ from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
     quaternion_to_matrix,
-    R_FLU_OPTICAL,
     rotation_vector_to_matrix,
     rpy_from_matrix,
 )
@@ -132,11 +131,9 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
     path = OwnPath(motion.states)
-    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
     fit = None
     with suppress(ValueError):  # reported with the calibration
-        fit = fit_axes(seen.shifts, path, camera_model(seen),
-                       quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL,
+        fit = fit_axes(seen.shifts, path, camera_model(seen), seen.camera_rotation,
                        up if lean >= LEAN_ERROR else None)
     yield from _check_axes(seen, motion, up, lean, fit)
     sure = fit if fit is not None and fit.best >= MIN_EXPLAINED else None
@@ -147,7 +144,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
         yield Finding(UNMEASURED, 'camera mounting', 'turned too little, or too little texture: '
                       'roll, pitch and yaw it by hand', MOUNTED)
     else:
-        yield check_mounting(sure.mounting, sure.mounting_deviations, rpy)
+        yield check_mounting(sure.mounting, sure.mounting_deviations, seen.camera_rpy)
 
 
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:

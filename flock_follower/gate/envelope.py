@@ -130,6 +130,12 @@ class Location(NamedTuple):
     offset: Array | None = None
     """Horizontal offset (2,), m, from the position at ACTIVE; None before."""
 
+    @property
+    def known_height(self) -> float | None:
+        """Return the height, m; None if the height or the climb rate is unknown."""
+        known = self.height is not None and math.isfinite(self.height + self.climb_rate)
+        return self.height if known else None
+
 
 def approach_speed(distance: float, deceleration: float) -> float:
     """
@@ -157,11 +163,11 @@ def vertical_range(limits: GateLimits, place: Location, climb_rate: float, horiz
     :param horizon: time in which the speed is reached, s.
     :param a_max: largest magnitude of the acceleration, m/s^2.
     """
-    if place.height is None or not math.isfinite(place.height + place.climb_rate):
+    height, braking = place.known_height, BRAKING_SHARE * a_max
+    if height is None:
         return -math.inf, math.inf
-    braking = BRAKING_SHARE * a_max
-    falling = approach_speed(place.height - limits.height_min, braking)
-    rising = approach_speed(limits.height_max - place.height, braking)
+    falling = approach_speed(height - limits.height_min, braking)
+    rising = approach_speed(limits.height_max - height, braking)
     lowest, highest = sorted((climb_rate, place.climb_rate))
     return (-falling - lowest) / horizon, (rising - highest) / horizon
 

@@ -191,7 +191,7 @@ class Permission:
         return self if self.phase is not Phase.ACTIVE else self._giving_back(
             f'two nodes command: {who}', Cause.CONTESTED)
 
-    def fall_silent(self, why: str, mode_age: float = 0.0) -> Permission:
+    def fall_silent(self, why: str, mode_age: float) -> Permission:
         """
         Stop sending, because no velocity is valid; the autopilot's failsafe then starts.
 

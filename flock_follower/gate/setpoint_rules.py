@@ -200,7 +200,7 @@ def _marker_obstacle(situation: Situation) -> Obstacle | None:
         return Obstacle.NOT_RELATIVE
     if not fresh(situation.source_age, OLDEST_MARKER):
         return Obstacle.MARKER_LOST
-    if place.height is None or not math.isfinite(place.height + place.climb_rate):
+    if place.known_height is None:
         return Obstacle.NO_HEIGHT
     return None if situation.report.airborne else Obstacle.ON_GROUND
 

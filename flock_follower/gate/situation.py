@@ -16,8 +16,8 @@
 The situation of one decision: all inputs of ``setpoint_rules.decide`` as one value.
 
 The gate collects its inputs in a ``Situation``; ``decide`` returns the setpoint for it.
-``to_json`` writes a situation as one line, ``read_situation`` reads the line, so a decision can
-be repeated.
+``to_json`` writes a situation as one line; ``test/recorded_situation.py`` reads the line, so that
+a decision can be repeated.
 """
 
 from __future__ import annotations

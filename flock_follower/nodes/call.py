@@ -32,7 +32,6 @@ import time
 
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.mavlink.commands import (
     CONFIRM_TIMEOUT,
@@ -43,6 +42,7 @@ from flock_follower.mavlink.commands import (
 )
 from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
 from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.service_calls import make_request, service_type
 
 POLL_PERIOD = 0.1  # s between looks for the service
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
@@ -79,8 +79,7 @@ class Caller(Node):
     def __init__(self, service: str, value: bool | None, timeout: float) -> None:
         super().__init__('caller', start_parameter_services=False)
         self._service, self._timeout = self.resolve_service_name(service), timeout
-        self._kind = Trigger if value is None else SetBool
-        self._request = Trigger.Request() if value is None else SetBool.Request(data=value)
+        self._kind, self._request = service_type(value), make_request(value)
         self._client = self.create_client(self._kind, service)
 
     def spin(self) -> int:

@@ -40,7 +40,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Range
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.bags.live_line import LiveLine
 from flock_follower.nodes.call import patience
@@ -57,6 +56,7 @@ from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
 from flock_follower.nodes.support.output import never_block_output
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.service_calls import make_request, service_type
 from flock_follower.signals import ending
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
@@ -78,7 +78,7 @@ class Pilot(Node):
         self._keyboard = True
         self._line = LiveLine()
         self._calls: dict[str, tuple[Any, float]] = {}
-        self._callers = {step: self.create_client(Trigger if value is None else SetBool, service)
+        self._callers = {step: self.create_client(service_type(value), service)
                          for step, (service, value) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._take, 50)
         self.create_subscription(String, 'mavlink_bridge/state', self._take_state, LATCHED_QOS)
@@ -167,7 +167,7 @@ class Pilot(Node):
     def _request(self, steps: list[str]) -> None:
         for step in steps:
             service, value = SERVICES[step]
-            request = Trigger.Request() if value is None else SetBool.Request(data=value)
+            request = make_request(value)
             self._calls[step] = (self._callers[step].call_async(request),
                                  time.monotonic() + patience(service))
 

@@ -39,7 +39,6 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
@@ -63,6 +62,7 @@ from flock_follower.nodes.support.output import never_block_output
 from flock_follower.nodes.support.process import run, spin
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import deserialize, FlockNode, READERS, Waiting
+from flock_follower.nodes.support.service_calls import make_request, service_type
 from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.cameras import cameras, CameraValues
@@ -117,7 +117,7 @@ class View(FlockNode):
         self._calls: list[tuple[str, Any, float]] = []
         """Each pressed button, the future of its answer, and the time until which it waits."""
         self._callers = {
-            button: self.create_client(Trigger if value is None else SetBool, service)
+            button: self.create_client(service_type(value), service)
             for button, (service, value) in CALLS.items()} if values['control'] else {}
         take = self._flight
         self._always = [
@@ -331,10 +331,9 @@ class View(FlockNode):
     def _call(self, button: str, now: float) -> None:
         """Call the service of a button at each press, because the last answer may be lost."""
         value = CALLS[button][1]
-        request = Trigger.Request() if value is None else SetBool.Request(data=value)
         self.get_logger().info(f'{button}: pressed on the page')
         self._calls.append((
-            button, self._callers[button].call_async(request), now + ANSWER_TIMEOUT))
+            button, self._callers[button].call_async(make_request(value)), now + ANSWER_TIMEOUT))
 
     def _take_answers(self, now: float) -> None:
         """Pass on answers to buttons."""

@@ -281,12 +281,16 @@ class TwistFrame:
         """Return the frame to use for a velocity, from its value (3,), m/s, in both readings."""
         if self.wanted != AUTO or self.found:
             return self.frame
-        if self.failing or self.contradiction or not child.any():
-            return NONE
-        differ = float(np.abs(child - odom).max()) > SAME_VELOCITY
-        if abs(self._evidence) < LIKELY_EVIDENCE and differ:
+        if self.is_contradicted or not child.any() or (
+                abs(self._evidence) < LIKELY_EVIDENCE
+                and float(np.abs(child - odom).max()) > SAME_VELOCITY):
             return NONE
         return CHILD if self._evidence >= 0.0 else ODOM
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Return whether the positions contradict the velocity, while no frame is found."""
+        return self.failing > 0 or self.contradiction > 0.0
 
     @property
     def wrong_probability(self) -> float:

@@ -288,9 +288,8 @@ class OdometrySource:
                 # The step that another reading would be is faded out; not a velocity that the
                 # positions contradict.
                 left = np.zeros(3) if self._fading is None else self._fading
-                self._fading = None if self._reading == NONE and (
-                    self.twist.failing or self.twist.contradiction) else (
-                        left + self._as_read(before, time, child, odom)) - velocity
+                self._fading = None if self._reading == NONE and self.twist.is_contradicted else (
+                    left + self._as_read(before, time, child, odom)) - velocity
         if self._fading is not None and np.count_nonzero(self._fading):
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading

@@ -47,6 +47,8 @@ _JPEG_END: Final[bytes] = b'\xff\xd9'
 # Start of frame: every marker from 0xC0 to 0xCF but tables (C4), extensions (C8), arithmetic (CC).
 _JPEG_FRAMES: Final[frozenset[int]] = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_FILL: Final[int] = 0xFF
+FARTHEST_PIXEL = 16384.0  # px: a line with a point farther outside is not drawn
+_SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
 
 def file_size(data: bytes) -> tuple[int, int]:
@@ -262,6 +264,13 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
     if not done:
         raise ValueError(f'image of {image.shape[1]}x{image.shape[0]} px: cannot be encoded')
     return bytes(data)
+
+
+def draw_line(canvas: Any, pixels: Array, color: Any) -> None:
+    """Draw a line through pixels (n, 2), unless a point is NaN or far outside."""
+    if (np.abs(pixels) < FARTHEST_PIXEL).all():
+        fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(canvas, [fixed], False, color, 2, cv2.LINE_AA, _SHIFT)
 
 
 def gray_levels(image: GrayImage, pixels: Array) -> Any:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from flock_follower.geometry import Array
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import draw_line, GrayImage
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.tracker import Sighting
@@ -37,8 +37,6 @@ AXIS_COLORS: tuple[Color, ...] = ((70, 70, 255), (70, 255, 70), (255, 120, 70))
 WHITE: Color = (255, 255, 255)
 
 LINE = 20  # px from one line of text to the next
-FAR = 16384.0  # px: a line with a point farther outside is not drawn
-_SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
 
 def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
@@ -63,11 +61,11 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
             pose = body @ marker.T_body_marker
             if pose.rotation[:, 2] @ pose.translation < 0.0:
                 corners = marker_corners(marker.side_length)[[0, 1, 2, 3, 0]]
-                _line(canvas, camera.project(pose.apply(corners)), STAGE_COLORS[stage])
+                draw_line(canvas, camera.project(pose.apply(corners)), STAGE_COLORS[stage])
         for axis, color in zip(np.eye(3), AXIS_COLORS):
             tip = 0.5 * neighbor.markers[0].side_length * axis
-            _line(canvas, camera.project(body.apply(np.array([np.zeros(3), tip]))), color)
-        _line(canvas, ellipse_pixels(camera, measurement), WHITE)
+            draw_line(canvas, camera.project(body.apply(np.array([np.zeros(3), tip]))), color)
+        draw_line(canvas, ellipse_pixels(camera, measurement), WHITE)
         lines.append(f'{neighbor.name}: {stage}, {np.linalg.norm(body.translation):.2f} m')
     lines += [f'{name}: the same marker again' for name in sighting.duplicates]
     lines += [f'other marker: {marker_id}' for marker_id in sighting.other_ids]
@@ -88,10 +86,3 @@ def ellipse_pixels(camera: CameraModel, measurement: Measurement) -> Array:
     circle = np.hstack([np.cos(angle), np.sin(angle)])
     rim: Array = pixels + 2.0 * circle * np.sqrt(np.maximum(values, 0.0)) @ axes.T
     return rim
-
-
-def _line(canvas: ColorImage, pixels: Array, color: Color) -> None:
-    """Draw a line through pixels (N, 2), unless a point is NaN or far outside."""
-    if (np.abs(pixels) < FAR).all():
-        fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(canvas, [fixed], False, color, 2, cv2.LINE_AA, _SHIFT)

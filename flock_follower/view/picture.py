@@ -24,15 +24,18 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import encode_jpeg, GrayImage
+from flock_follower.perception.images import (
+    draw_line,
+    encode_jpeg,
+    FARTHEST_PIXEL,
+    GrayImage,
+)
 from flock_follower.view.flight import shadow
 from flock_follower.view.scene import ARROW, BOX, COLORS, ELLIPSOID, LINE, Shape, TEXT
 
 WIDTH = 640  # px: a wider image is reduced, for the link and the processor
 QUALITY = 70  # of the JPEG: 640x480 px take about 40 kB
 FONT_SCALE = 0.6  # scale of OpenCV's font: letters 13 px high
-FARTHEST_PIXEL = 16384.0  # px: a line with a point farther outside is not drawn
-_SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 _SIGNS: Final = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5)
                           for z in (-0.5, 0.5)])
 #: The edges of a box, as pairs of rows of ``_SIGNS``.
@@ -67,7 +70,7 @@ def draw_picture(image: GrayImage, camera: CameraModel | None, T_odom_camera: Tr
             for line in outlines(shape):
                 pixels = camera.project(to_camera.apply(line))
                 # The middle of a pixel is whole: that of the reduced image, too.
-                _line(canvas, (pixels + 0.5) * scale - 0.5, _color(shape.paint))
+                draw_line(canvas, (pixels + 0.5) * scale - 0.5, _color(shape.paint))
             if shape.kind == TEXT:
                 at = camera.project(to_camera.apply(np.asarray(shape.position)[None]))[0]
                 _text(canvas, (at + 0.5) * scale - 0.5, shape.text, _color(shape.paint, 0.5))
@@ -97,13 +100,6 @@ def _color(paint: str, white: float = 0.0) -> Any:
     """Return blue, green and red of a paint; ``white`` is the share of white in it."""
     red, green, blue, _ = COLORS[paint]
     return tuple(255.0 * (white + (1.0 - white) * share) for share in (blue, green, red))
-
-
-def _line(canvas: Canvas, pixels: Array, color: Any) -> None:
-    """Draw the segments between pixels (n, 2) whose ends are in front of the camera."""
-    if (np.abs(pixels) < FARTHEST_PIXEL).all():
-        fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(canvas, [fixed], False, color, 2, cv2.LINE_AA, _SHIFT)
 
 
 def _text(canvas: Canvas, at: Array, text: str, color: Any) -> None:

@@ -29,6 +29,7 @@ from flock_follower.gate.permission import (
     Permission,
     Phase,
     STICK,
+    Taker,
 )
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.mavlink import takeover
@@ -44,6 +45,7 @@ ENDED = 'end', 'hold requested'
 MOVED = 'end', STICK.text, Cause.STICK
 REBOOTED = 'reset', 'the autopilot rebooted'
 SECOND = 'contest', '/planner, /other'
+SILENT = 'fall_silent', 'no velocity', 0.1  # since the last message with the mode, s
 LANDED = 'land',
 GROUND = 'on the ground'
 
@@ -128,8 +130,8 @@ def test_a_stick_takes_over_no_flight_that_none_took(events):
 
 
 @pytest.mark.parametrize('events', [
-    (), (ENDED,), (('end', 'low battery'), seen(PILOT, 5.0)), (('fall_silent', 'no velocity'),),
-    (ENDED, ('fall_silent', 'no velocity')), (LANDED,), (seen(DISARMED, 5.0),)])
+    (), (ENDED,), (('end', 'low battery'), seen(PILOT, 5.0)), (SILENT,),
+    (ENDED, SILENT), (LANDED,), (seen(DISARMED, 5.0),)])
 def test_nothing_but_a_request_undoes_a_moved_stick(events):
     permission = after(ASKED, seen(OURS, 5.0), MOVED, *events)
     assert permission.takeover_refusal(14.9).startswith('the pilot took over')
@@ -137,8 +139,13 @@ def test_nothing_but_a_request_undoes_a_moved_stick(events):
     assert not next_permission(permission, ('request', 15.0)).takeover_refusal(15.0)
 
 
+def test_a_mode_left_after_a_moved_stick_is_a_takeover():
+    assert after(ASKED, seen(OURS), MOVED, seen(PILOT, 5.0)).announcement() == (
+        'TAKEN_OVER: offboard was left for POSCTL: the pilot moved a stick')
+
+
 @pytest.mark.parametrize('ended', [
-    (('fall_silent', 'no velocity'),), (ENDED, seen(HOLD, 5.0))])
+    (SILENT,), (ENDED, seen(HOLD, 5.0))])
 def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
     permission = after(ASKED, seen(OURS, 5.0), *ended, MOVED)
     assert permission.phase is Phase.INACTIVE
@@ -146,11 +153,11 @@ def test_a_stick_moved_as_the_stream_ends_bars_offboard(ended):
     assert not permission.takeover_refusal(15.0) and after(MOVED) == Permission()
 
 
-UNSEEN = ('fall_silent', 'no velocity', 3.1)  # without a mode for so long, s
+UNSEEN = 'fall_silent', 'no velocity', 3.1
 
 
 @pytest.mark.parametrize('events', [
-    (UNSEEN,), (('follow_silence', 5.1), ('fall_silent', 'no velocity')), (UNSEEN, ENDED)])
+    (UNSEEN,), (('follow_silence', 5.1), SILENT), (UNSEEN, ENDED)])
 def test_silence_hides_no_switch_that_was_not_seen(events):
     silent = after(ASKED, seen(OURS), *events)
     assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
@@ -161,8 +168,8 @@ def test_silence_hides_no_switch_that_was_not_seen(events):
     assert not landed.takeover_refusal(20.0)
     assert next_permission(landed, seen(PILOT, 21.0)) is landed
     # Nothing is hidden if the mode was known, or had not been there yet.
-    for known in (after(ASKED, seen(OURS), ('fall_silent', 'no velocity', 3.0)),
-                  after(ASKED, UNSEEN)):
+    for known in (after(ASKED, seen(OURS), SILENT), after(ASKED, UNSEEN),
+                  after(ASKED, seen(OURS), ('fall_silent', 'no velocity', 3.0))):
         assert next_permission(known, seen(PILOT, 20.0)) is known
 
 
@@ -196,11 +203,11 @@ def test_a_heartbeat_from_before_the_request_has_no_effect(received):
 
 def test_refused_request_ends_and_stream_without_velocity_stops():
     assert after(ASKED, ('fail', 'refused')).announcement() == 'INACTIVE: refused'
-    silent = after(ASKED, seen(OURS), ('fall_silent', 'no velocity'))
+    silent = after(ASKED, seen(OURS), SILENT)
     assert silent.announcement() == 'INACTIVE: fell silent: no velocity'
     for idle in (after(), after(ASKED, seen(OURS), seen(PILOT))):
         assert next_permission(idle, ('fail', 'refused')) is idle
-        assert next_permission(idle, ('fall_silent', 'no velocity')) is idle
+        assert next_permission(idle, SILENT) is idle
 
 
 def test_late_refusal_ends_nothing_that_vehicle_already_obeys():
@@ -224,6 +231,11 @@ def test_giving_back_brakes_until_mode_is_left_then_stops():
     assert next_permission(giving, seen(DISARMED)).announcement() == (
         'INACTIVE: given back (hold requested)')
     assert after(ASKED, seen(HOLD), ENDED).announcement() == 'INACTIVE: hold requested'
+
+
+def test_only_an_unknown_taker_may_be_a_failsafe():
+    taken = after(ASKED, seen(OURS), seen(PILOT, 5.0)).name_taker(Taker('a pilot', True), 5.0)
+    assert taken.takeover_refusal(5.0).startswith('the pilot took over')
 
 
 def test_where_two_nodes_command_it_brakes_until_asked_again():
@@ -258,7 +270,7 @@ def test_long_silence_may_hide_a_takeover_and_return():
 
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [('request', 1.0), ('follow_silence', 5.1), ('fall_silent', 'no velocity'), UNSEEN,
+EVENTS = [('request', 1.0), ('follow_silence', 5.1), SILENT, UNSEEN,
           ('fail', 'late'), LANDED, ENDED, MOVED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]

@@ -19,13 +19,13 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from recorded_situation import read_situation
 from situations import situation
 
 from flock_follower.command_messages import Command, OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.obstacle import Obstacle
 from flock_follower.gate.permission import MODE_TIMEOUT
-from flock_follower.gate.recorded_situation import read_situation
 from flock_follower.gate.relative_flight import Relative
 from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, LEVEL, NONE
 from flock_follower.gate.situation import Held

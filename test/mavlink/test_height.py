@@ -49,7 +49,7 @@ def flown(seconds, altitude=lambda t: 100.0, rate=lambda t: 0.0):
 def test_pressures_are_altitudes_of_the_standard_atmosphere():
     assert pressure_altitude(1013.25) == 0.0
     assert pressure_altitude(954.61) == pytest.approx(500.0, abs=0.5)  # ISO 2533
-    assert all(math.isnan(pressure_altitude(p)) for p in (0.0, -1.0, math.nan, math.inf, 1e9))
+    assert all(math.isnan(pressure_altitude(p)) for p in (0.0, -1.0, 2000.0, math.nan, math.inf))
 
 
 def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():

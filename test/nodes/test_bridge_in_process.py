@@ -32,11 +32,11 @@ from driven import DEADLINE, Driven, overrides, to_odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
+from recorded_situation import read_situation
 from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.bridge_state import REFUSED
 from flock_follower.command_messages import Command, trajectory
-from flock_follower.gate.recorded_situation import read_situation
 from flock_follower.gate.setpoint_rules import COMMAND
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle

@@ -24,7 +24,7 @@ from typing import Any
 
 from driven import Driven, overrides, START, to_odometry
 from geometry_msgs.msg import TransformStamped
-from marker_images import make_camera, render
+from marker_images import make_camera, render, TAIL
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, Range, RegionOfInterest
@@ -53,8 +53,6 @@ from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pose_messages import from_pose
 
 CAMERA = make_camera()
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
 OWN = Transform.from_quaternion([1.0, 2.0, 3.0], quaternion_from_yaw(2.0))
 AHEAD = Transform.from_quaternion([2.2, 0.3, 0.1], quaternion_from_yaw(0.3))
 LEADER = OWN @ AHEAD

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
-from marker_images import make_camera, render
+from marker_images import make_camera, render, TAIL
 import numpy as np
 import pytest
 
@@ -36,8 +36,6 @@ from flock_follower.pose_messages import from_pose
 
 RATE, IMAGES = 30.0, 60
 LEADER = Transform.from_quaternion([2.0, 0.0, 0.1], quaternion_from_yaw(0.3))
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))  # as config/neighbors.yaml has it
 LENS = camera_mounting([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 

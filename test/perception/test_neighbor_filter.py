@@ -30,7 +30,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception.innovation import ALIKE_TIME
+from flock_follower.perception.innovation import ALIKE_TIME, to_body
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -241,6 +241,15 @@ def test_errors_alike_between_images_do_not_average_out(
     assert least < np.mean(squares) < most
 
 
+def test_alike_errors_of_a_mirrored_attitude_are_of_the_place() -> None:
+    tracker, alike = NeighborFilter(), 0.8 * NOISE
+    for k in range(10):
+        tracker.update(k * DT, measured(truth(k * DT)), TAIL, NOISE, alike=alike)
+    body = mirrored(measured(truth(10 * DT)))
+    assert tracker.update(10 * DT, body, TAIL, NOISE, alike=alike) is UpdateOutcome.POSITION_ONLY
+    np.linalg.cholesky(known(tracker.newest).covariance)
+
+
 def test_alike_errors_are_forgotten_once_measurements_have_none() -> None:
     with_some, without = NeighborFilter(), NeighborFilter()
     for k in range(90):
@@ -263,6 +272,13 @@ def test_a_contradicted_attitude_is_dropped_within_0_3_s(rate: float, images: in
                 for k in range(20, 20 + images)]
     assert outcomes == [UpdateOutcome.POSITION_ONLY] * (images - 1) + [UpdateOutcome.STARTED]
     assert (images - 1) * period < 0.3
+
+
+def test_a_new_track_drops_its_attitude_as_soon_as_an_old_one() -> None:
+    tracker, period = NeighborFilter(), 1.0 / 15.0
+    update(tracker, 0.0, mirrored(truth(0.0)))
+    outcomes = [update(tracker, k * period, truth(k * period)) for k in range(1, 5)]
+    assert outcomes == [UpdateOutcome.POSITION_ONLY] * 3 + [UpdateOutcome.STARTED]
 
 
 @pytest.mark.parametrize(('t', 'outcome'), [
@@ -297,3 +313,340 @@ def test_twist_covariance_is_that_of_perturbed_states() -> None:
     ratios = np.linalg.eigvals(np.linalg.solve(actual, estimate.child_twist_covariance)).real
     assert ratios.min() > 0.9
     assert ratios.max() < 1.1
+
+
+def gated(off: float, tracker: NeighborFilter | None = None, t: float = 1.0 + DT,
+          reach: float = math.inf) -> tuple[UpdateOutcome, Array, float]:
+    """
+    Return what a measurement sideways does whose chi^2 is ``off`` times the gate's.
+
+    These are the outcome, how far it moves the state, and the way measured, m. A negative ``off``
+    is the same on the other side.
+    """
+    tracker = tracker or tracked(1.0)
+    before = now(tracker, t)
+    # The position of the body: the lever adds the noise of the attitude.
+    lever = to_body(before.rotation @ TAIL)
+    spread = before.covariance[:3, :3] + (lever @ NOISE @ lever.T)[:3, :3]
+    way = np.array([0.0, 1.0, 0.0])
+    way *= math.copysign(
+        math.sqrt(abs(off) * GATE_CHI2 / (way @ np.linalg.solve(spread, way))), off)
+    there = Transform(before.rotation, before.position + way)
+    outcome = tracker.update(t, there, TAIL, NOISE, reach)
+    return outcome, now(tracker, t).position - before.position, float(way[1])
+
+
+@pytest.mark.parametrize(('off', 'outcome'), [
+    (0.999, UpdateOutcome.USED), (1.001, UpdateOutcome.SURPRISING),
+    (9.999, UpdateOutcome.SURPRISING), (10.001, UpdateOutcome.OUTLIER)])
+def test_the_gate_is_one_chi2_and_refuses_ten(off: float, outcome: UpdateOutcome) -> None:
+    assert gated(off)[0] is outcome
+
+
+@pytest.mark.parametrize(('off', 'outcome'), [
+    (0.999, UpdateOutcome.USED), (1.001, UpdateOutcome.OUTLIER)])
+def test_reach_bounds_only_what_is_outside_the_gate(off: float, outcome: UpdateOutcome) -> None:
+    assert gated(off, reach=0.0)[0] is outcome
+
+
+def test_the_gate_holds_999_of_1000_good_measurements() -> None:
+    # The distribution of chi^2 with 3 degrees of freedom.
+    share = math.erf(math.sqrt(0.5 * GATE_CHI2)) - math.sqrt(
+        2.0 * GATE_CHI2 / math.pi) * math.exp(-0.5 * GATE_CHI2)
+    assert share == pytest.approx(0.999, abs=1e-5)
+
+
+@pytest.mark.parametrize('off', [0.5, 1.5, 6.0])
+def test_a_surprise_leaves_the_covariance_of_its_weight(off: float) -> None:
+    tracker, t = tracked(1.0), 1.0 + DT
+    before = now(tracker, t)
+    gated(off, tracker, t)
+    lever = to_body(before.rotation @ TAIL)
+    spread = max(off, 1.0) * (before.pose_covariance + lever @ NOISE @ lever.T)
+    across = before.covariance[np.r_[0:3, 6:9]]
+    np.testing.assert_allclose(
+        now(tracker, t).covariance,
+        before.covariance - across.T @ np.linalg.solve(spread, across), rtol=1e-5, atol=1e-10)
+
+
+def test_a_first_surprise_weighs_as_much_as_one_on_the_gate() -> None:
+    _, on_gate, way = gated(1.0)
+    for off in (2.0, 4.0, 9.0):
+        _, moved_by, farther = gated(off)
+        assert farther == pytest.approx(math.sqrt(off) * way)
+        # The weight falls with the square of the way: so does the move with the way.
+        np.testing.assert_allclose(moved_by, on_gate / math.sqrt(off), rtol=1e-6)
+
+
+@pytest.mark.parametrize('off', [1.2, 5.0])
+def test_any_second_surprise_on_the_same_side_weighs_more(off: float) -> None:
+    shares = []
+    for side in (1.0, -1.0):
+        tracker = tracked(1.0)
+        gated(off, tracker)
+        _, moved_by, way = gated(side * off, tracker, 1.0 + 2.0 * DT)
+        shares.append(float(moved_by[1]) / way)
+    assert shares[0] > 1.15 * shares[1] > 0.0
+
+
+def test_what_holds_nan_is_refused_and_changes_nothing() -> None:
+    tracker, t = tracked(1.0), 1.0 + DT
+    before = now(tracker, t)
+    for body, covariance in ((moved(truth(t), math.nan, 0.0, 0.0), NOISE),
+                             (truth(t), np.full((6, 6), math.nan))):
+        assert tracker.update(t, body, TAIL, covariance) is UpdateOutcome.OUTLIER
+        assert tracker.change is None
+        np.testing.assert_array_equal(now(tracker, t).position, before.position)
+
+
+def turned(body: Transform, angle: float) -> Transform:
+    """Return a body turned by an angle, rad, about its tail."""
+    rotation = rotation_vector_to_matrix([0.0, 0.0, angle]) @ body.rotation
+    return Transform(rotation, body.apply(TAIL[None])[0] - rotation @ TAIL)
+
+
+def test_second_surprising_attitude_counts_on_the_same_side_only() -> None:
+    shares = []
+    for side in (1.0, -1.0):
+        tracker, t = tracked(1.0), 1.0 + DT
+        spread = now(tracker, t).covariance[8, 8] + NOISE[5, 5]
+        angle = math.sqrt(4.0 * GATE_CHI2 * spread)
+        assert angle < 0.3  # else it counts as mirrored
+        assert update(tracker, t, turned(truth(t), angle)) is not UpdateOutcome.POSITION_ONLY
+        before = now(tracker, t + DT).rotation
+        update(tracker, t + DT, turned(truth(t + DT), side * angle))
+        after = now(tracker, t + DT).rotation
+        shares.append(side * matrix_to_rotation_vector(after @ before.T)[2] / angle)
+    assert shares[0] > 1.5 * shares[1] > 0.0
+
+
+def test_a_first_surprising_attitude_weighs_as_one_on_the_gate() -> None:
+    turns = []
+    for off in (0.999, 4.0):
+        tracker, t = NeighborFilter(), 31 * DT
+        for k in range(31):  # without a lever no position depends on the attitude
+            tracker.update(k * DT, truth(k * DT), np.zeros(3), NOISE)
+        before = now(tracker, t)
+        angle = math.sqrt(off * GATE_CHI2 * (before.covariance[8, 8] + NOISE[5, 5]))
+        turn = rotation_vector_to_matrix([0.0, 0.0, angle])
+        tracker.update(t, Transform(turn @ before.rotation, before.position), np.zeros(3), NOISE)
+        turns.append(matrix_to_rotation_vector(now(tracker, t).rotation @ before.rotation.T)[2])
+    assert turns[1] == pytest.approx(0.5 * turns[0], rel=2e-3) and turns[0] > 0.005
+
+
+@pytest.mark.parametrize(('angle', 'outcome'), [
+    (0.29, UpdateOutcome.USED), (0.31, UpdateOutcome.POSITION_ONLY)])
+def test_attitude_outside_the_gate_is_mirrored_from_0_3_rad(
+        angle: float, outcome: UpdateOutcome) -> None:
+    tracker, t = tracked(1.0), 1.0 + DT
+    body = truth(t)
+    before, noise = now(tracker, t), NOISE + np.diag([0.0, 0.0, 0.0, 0.03, 0.03, 0.03])**2
+    spread = before.covariance[8, 8] + noise[5, 5]
+    assert GATE_CHI2 < angle**2 / spread < 10.0 * GATE_CHI2
+    there = Transform(rotation_vector_to_matrix([0.0, 0.0, angle]) @ before.rotation,
+                      body.translation)
+    assert tracker.update(t, there, np.zeros(3), noise) is outcome
+
+
+def test_many_contradictions_restart_a_fast_camera_early() -> None:
+    tracker, period = tracked(1.0, params=FilterParams(max_rejections=4)), 0.002
+    outcomes = [update(tracker, 1.0 + k * period, mirrored(truth(1.0 + k * period)))
+                for k in range(1, 5)]
+    assert outcomes == [UpdateOutcome.POSITION_ONLY] * 3 + [UpdateOutcome.STARTED]
+
+
+def test_an_agreeing_attitude_ends_a_row_of_contradictions() -> None:
+    tracker, t = tracked(1.0), 1.0
+    for contradicts in (True, True, False) * 8:
+        t += 0.1
+        body = mirrored(truth(t)) if contradicts else truth(t)
+        assert update(tracker, t, body) is (
+            UpdateOutcome.POSITION_ONLY if contradicts else UpdateOutcome.USED)
+
+
+def test_a_track_begins_with_the_deviations_of_its_parameters() -> None:
+    params = FilterParams(initial_speed=0.7, acceleration=0.4)
+    tracker = NeighborFilter(params)
+    assert update(tracker, 0.0, truth(0.0)) is UpdateOutcome.STARTED
+    begun = now(tracker, 0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(begun.covariance)[3:]), [
+        0.7, 0.7, 0.7, 0.02, 0.02, 0.01, 0.5, 0.5, 0.5, 0.4, 0.4, 0.4])
+    np.testing.assert_array_equal(np.concatenate(
+        [begun.velocity, begun.angular_velocity, begun.acceleration]), np.zeros(9))
+    np.testing.assert_array_equal(begun.position, truth(0.0).translation)
+    np.testing.assert_array_equal(begun.rotation, truth(0.0).rotation)
+
+
+def test_restart_of_an_attitude_keeps_what_is_known_of_motion() -> None:
+    tracker = NeighborFilter()
+    for k in range(60):
+        update(tracker, k * DT, mirrored(measured(truth(k * DT))))
+    for k in range(60, 66):
+        expected = now(tracker, k * DT)
+        outcome = update(tracker, k * DT, measured(truth(k * DT)))
+    assert outcome is UpdateOutcome.STARTED
+    begun, motion = now(tracker, 65 * DT), np.r_[3:6, 12:15]
+    np.testing.assert_array_equal(begun.velocity, expected.velocity)
+    np.testing.assert_array_equal(begun.acceleration, expected.acceleration)
+    np.testing.assert_array_equal(begun.covariance[np.ix_(motion, motion)],
+                                  expected.covariance[np.ix_(motion, motion)])
+    np.testing.assert_array_equal(begun.covariance[9:12, 9:12], 0.5**2 * np.eye(3))
+
+
+def test_a_place_is_the_last_one_moved_by_the_velocity() -> None:
+    tracker = tracked(1.0)
+    assert NeighborFilter().place(0.0) is None
+    last = now(tracker, 1.0)
+    for t in (1.0, 1.5, 3.0):
+        place = known(tracker.place(t))
+        np.testing.assert_allclose(place.translation, last.position + (t - 1.0) * last.velocity)
+        np.testing.assert_array_equal(place.rotation, last.rotation)
+    assert tracker.place(0.99) is None and tracker.place(3.01) is None  # max_gap is 2 s
+
+
+def test_a_state_near_the_last_one_is_known_before_and_after() -> None:
+    assert NeighborFilter().near(1.0) is None
+    tracker = tracked(2.0, noisy=False)
+    assert tracker.near(2.0) is tracker.newest
+    for t in (1.9, 2.1):
+        estimate = known(tracker.near(t))
+        assert estimate.stamp == t
+        np.testing.assert_allclose(estimate.position, truth(t).translation, atol=5e-3)
+    np.testing.assert_array_equal(estimate.covariance, now(tracker, 2.1).covariance)
+
+
+def test_a_continued_filter_bridges_longer_gaps() -> None:
+    tracker = tracked(10.0)  # a steady flight: it learns that little changes
+    tracker.walk = 0.02
+    other = tracker.continued(5.0)
+    assert tracker.predict(14.0) is None and other.predict(14.0) is not None
+    assert other.newest is tracker.newest
+    assert tracker.predict(12.0) is not None and other.params.max_rejections == 6
+    soon, of_other = now(tracker, 10.2), now(other, 10.2)
+    np.testing.assert_array_equal(of_other.position, soon.position)
+    for k in range(6):
+        assert of_other.covariance[k, k] > soon.covariance[k, k]
+    # The drift of the ego position is kept, too.
+    still = tracked(10.0).continued(5.0)
+    drift = of_other.covariance - now(still, 10.2).covariance
+    np.testing.assert_allclose(drift[:3, :3], 0.02**2 * 0.2 * np.eye(3), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(drift[3:], 0.0, atol=1e-12)
+
+
+def test_an_error_found_elsewhere_moves_the_state_and_widens_it() -> None:
+    NeighborFilter().add_error(np.ones(15))  # without a track it has no effect
+    tracker = tracked(1.0)
+    before, wrong = known(tracker.newest), np.zeros(15)
+    wrong[:3] = 0.03, -0.04, 0.0
+    now(tracker, 1.1)  # what was predicted before does not stay
+    tracker.add_error(wrong)
+    after = known(tracker.newest)
+    assert after.stamp == before.stamp
+    np.testing.assert_allclose(after.position, before.position + wrong[:3])
+    assert now(tracker, 1.1).position[0] > before.position[0] + 0.1 * before.velocity[0] + 0.02
+    widened = np.outer(wrong, wrong)
+    widened[3:6, 3:6] += (0.05 / 0.2)**2 * np.eye(3)
+    np.testing.assert_allclose(after.covariance - before.covariance, widened, atol=1e-12)
+    update(tracker, 1.0 + DT, truth(1.0 + DT))
+    assert tracker.change is None  # the innovation before had the error
+
+
+def test_a_change_is_that_of_two_innovations_in_a_row() -> None:
+    tracker = NeighborFilter()
+    innovations, spreads = [], []
+    for k, offset in enumerate((0.0, 0.004, -0.003)):
+        body = moved(truth(k * DT), offset, 0.0, 0.0)
+        expected = tracker.predict(k * DT)
+        tracker.update(k * DT, body, np.zeros(3), NOISE)
+        if expected is None:
+            assert tracker.change is None
+            continue
+        innovations.append(np.concatenate([
+            body.translation - expected.position,
+            matrix_to_rotation_vector(body.rotation @ expected.rotation.T)]))
+        spreads.append(expected.pose_covariance + NOISE)
+        assert (tracker.change is None) == (k < 2)
+    change = known(tracker.change)
+    np.testing.assert_allclose(change.difference, innovations[1] - innovations[0], atol=1e-12)
+    np.testing.assert_allclose(change.covariance, spreads[0] + spreads[1], atol=1e-12)
+
+
+def test_a_change_without_attitude_is_of_the_position() -> None:
+    tracker, t = tracked(1.0), 1.0 + DT
+    for body in (mirrored(truth(t)), truth(t + DT)):  # either of the two lacks the attitude
+        update(tracker, t, body)
+        change = known(tracker.change)
+        assert change.difference.shape == (3,) and change.covariance.shape == (3, 3)
+        t += DT
+    update(tracker, t, truth(t))
+    assert known(tracker.change).difference.shape == (6,)
+
+
+@pytest.mark.parametrize(('gap', 'known_change'), [(0.29, True), (0.31, False)])
+def test_a_change_over_a_gap_is_unknown(gap: float, known_change: bool) -> None:
+    tracker = tracked(1.0)
+    update(tracker, 1.0 + gap, truth(1.0 + gap))
+    assert (tracker.change is not None) == known_change
+
+
+def test_a_distance_makes_the_state_that_of_two_measurements() -> None:
+    tracker, t, variance = tracked(2.0), 2.1, 0.02**2
+    before = now(tracker, t)
+    own = np.array([0.5, -1.0, 1.0])
+    sight = before.position - own
+    length = float(np.linalg.norm(sight))
+    along = sight / length
+    tracker.update_range(t, length + 0.01, own, variance)
+    after = known(tracker.newest)
+    prior = float(along @ before.covariance[:3, :3] @ along)
+    gain = prior / (prior + variance)
+    assert along @ (after.position - before.position) == pytest.approx(0.01 * gain)
+    assert along @ after.covariance[:3, :3] @ along == pytest.approx((1.0 - gain) * prior)
+    # Velocity and acceleration follow, along the line of sight only.
+    of_velocity = float(along @ before.covariance[3:6, :3] @ along) / (prior + variance)
+    np.testing.assert_allclose(after.velocity - before.velocity, 0.01 * of_velocity * along)
+    assert (after.acceleration - before.acceleration) @ along > 0.0
+    assert tracker.change is None and after.stamp == t
+    np.testing.assert_array_equal(after.rotation, before.rotation)
+    np.testing.assert_allclose(after.covariance, after.covariance.T, atol=1e-15)
+
+
+@pytest.mark.parametrize('turns', [0.1, 3.0])  # rad: known, and unknown
+def test_an_antenna_off_the_line_makes_a_distance_less_certain(turns: float) -> None:
+    noise, arm = np.diag([0.01, 0.01, 0.01, turns, turns, turns])**2, np.array([0.0, 0.3, 0.0])
+    tracker = NeighborFilter()
+    tracker.update(0.0, Transform(translation=np.array([2.0, 0.0, 0.0])), np.zeros(3), noise)
+    place = np.array([2.0, 0.3, 0.0])
+    length = float(np.linalg.norm(place))
+    along = place / length
+    prior = now(tracker, 0.1).covariance
+    swing = np.cross(arm, along)
+    spread = float(along @ prior[:3, :3] @ along)
+    noise_of_distance = 0.01 + min(float(swing @ prior[6:9, 6:9] @ swing), 0.3**2)
+    tracker.update_range(0.1, length + 0.05, np.zeros(3), 0.01, arm)
+    moved_by = float(along @ (known(tracker.newest).position - [2.0, 0.0, 0.0]))
+    assert moved_by == pytest.approx(0.05 * spread / (spread + noise_of_distance))
+
+
+def test_a_distance_to_where_one_is_has_no_direction() -> None:
+    tracker = tracked(1.0)
+    before, place = known(tracker.newest), now(tracker, 1.1).position
+    for off, outcome in ((0.009, UpdateOutcome.OUTLIER), (0.011, UpdateOutcome.USED)):
+        own = place - np.array([off, 0.0, 0.0])
+        assert tracker.update_range(1.1, off, own, 0.01) is outcome
+        assert (tracker.newest is before) == (outcome is UpdateOutcome.OUTLIER)
+
+
+@pytest.mark.parametrize(('distance', 'outcomes'), [
+    # Too long by a detour: refused. Too short: used with care, and with more weight the second
+    # time.
+    (4.0, [UpdateOutcome.OUTLIER] * 2), (-0.6, [UpdateOutcome.SURPRISING] * 2)])
+def test_a_distance_outside_its_gate(distance: float, outcomes: list[UpdateOutcome]) -> None:
+    tracker, found, moves = tracked(1.0), [], []
+    for t in (1.1, 1.2):
+        before = now(tracker, t).position
+        length = float(np.linalg.norm(before))
+        found.append(tracker.update_range(t, length + distance, np.zeros(3), 0.01))
+        moves.append(length - float(np.linalg.norm(now(tracker, t).position)))
+    assert found == outcomes
+    assert moves[0] == pytest.approx(0.0) if distance > 0.0 else 0.0 < 2.0 * moves[0] < moves[1]

@@ -59,6 +59,17 @@ def commanded(decision: Decision) -> Array:
     return decision.acceleration
 
 
+def assert_within_limits(acceleration: Array, v: ArrayLike, a_max: float, v_max: float,
+                         period: float) -> None:
+    """Assert that an acceleration is within a_max, and leads to no speed above v_max and |v|."""
+    assert np.all(np.isfinite(acceleration))
+    assert np.linalg.norm(acceleration) <= a_max
+    speed = math.hypot(*np.asarray(v).tolist())
+    if speed < 100.0:
+        reached = np.linalg.norm(np.array(v) + acceleration * period)
+        assert reached <= max(v_max, speed * (1.0 + 1e-15))
+
+
 class Follower:
     """
     A follower in lock step; its yaw is the commanded one at once.

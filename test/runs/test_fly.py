@@ -105,6 +105,7 @@ def test_the_bounds_are_those_of_band_and_limits():
     assert judged(synthetic(speed=0.6))[1]['speed_max_m_s']
     for unknown in ({'cores': {}}, {'speed': None}):
         assert 'not measured' in judged(synthetic(), **unknown)[1]['cpu_cores.at_reference']
+    assert scenario_figures(synthetic(), {}, {})['cpu_speed'] is None
 
 
 @pytest.mark.parametrize(('cores', 'speed', 'ok'), [

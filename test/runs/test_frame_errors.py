@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from marker_images import TAIL
 import numpy as np
 import pytest
 
@@ -34,8 +35,6 @@ from flock_follower.perception.tracker import camera_mounting
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
 LEADER = MarkedNeighbor('leader', (Marker(0, 0.16, TAIL),))
 CAMERA = CameraModel(np.array([[610.0, 0, 319.5], [0, 610.0, 239.5], [0, 0, 1]]), np.zeros(5),
                      'plumb_bob', 640, 480)
