@@ -45,6 +45,9 @@ SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', '
 COHESION_INSISTENCE = 10.0
 #: Horizontal share of a bound's normal, below which no horizontal command helps.
 MIN_HORIZONTAL_SHARE = 0.1
+#: Time in which law and cohesion approach v_max, s: within one period, the noise of the velocity
+#: would be a command.
+SPEED_TIME = 0.4
 
 
 class Bound(NamedTuple):
@@ -82,12 +85,16 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     reasons = [] if horizontal.tolist() == nominal[:2].tolist() else ['a_max']
     rising = max(abs(float(v[2]) + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
-    reached = v[:2] + horizontal * period
-    target = limit_norm(reached, fastest)
-    if target.tolist() != reached.tolist():
-        horizontal = limit_norm((target - v[:2]) / period, strongest)
-        reasons.append('v_max')
-    command = limit_command([*horizontal.tolist(), vertical], v, a_max, v_max, period)
+    # Above v_max already: the speed falls within SPEED_TIME, and does not grow in this period.
+    most = max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
+    left = math.sqrt(max(most ** 2 - float(v[2] + vertical * period) ** 2, 0.0))
+    for limit, time in ((fastest, max(SPEED_TIME, period)), (left, period)):
+        reached = v[:2] + horizontal * time
+        target = limit_norm(reached, limit)
+        if target.tolist() != reached.tolist():
+            horizontal = limit_norm((target - v[:2]) / time, strongest)
+            reasons.append('v_max')
+    command = limit_command([*horizontal.tolist(), vertical], v, a_max, most, period)
     binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
     reason = ', '.join(binding) if 'finite' not in command.reason else command.reason
     return LimitedCommand(command.acceleration, reason)
@@ -133,13 +140,14 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
         return limit_command(a, v, a_max, fastest, period)
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
     vertical, strongest = requested[2], a_max * SENT_INSIDE
-    left = float(v[2]) + vertical * period
-    within = complex(*(-v[:2] / period)), math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
+    left = math.sqrt(max(fastest ** 2 - (float(v[2]) + vertical * period) ** 2, 0.0))
+    within, smooth = ((complex(*(-v[:2] / time)), left / time)
+                      for time in (period, max(SPEED_TIME, period)))
     goal = complex(*limit_norm(a, SANE)[:2])
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
     cohesion = [k for k, side in enumerate(sides) if side[2] == COHESION]
     if cohesion:
-        _yield_cohesion(goal, bounds, cohesion, Discs(*within, *within), discs)
+        _yield_cohesion(goal, bounds, cohesion, Discs(*smooth, *smooth), discs)
     point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.

@@ -24,7 +24,13 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.bound_keeping import limit_horizontal
+from flock_follower.planner.bound_keeping import (
+    Bound,
+    COHESION,
+    keep_bounds,
+    limit_horizontal,
+    SPEED_TIME,
+)
 from flock_follower.planner.limits import brake, limit_command, limit_norm, SENT_INSIDE
 
 A_MAX = 2.5
@@ -151,12 +157,27 @@ def test_the_altitude_goes_before_the_horizontal_pull() -> None:
 
 
 def test_room_is_left_for_the_climb_that_is_coming() -> None:
-    wanted, v = [2.0, 0.0, 0.0], [0.3, 0.0, 0.0]
+    wanted, v = [0.5, 0.0, 0.0], [0.3, 0.0, 0.0]
     for climb, fastest in ((0.0, 0.5), (0.3, 0.4), (-0.4, 0.3), (0.6, 0.0)):
         command = limit_horizontal(wanted, 0.0, v, A_MAX, V_MAX, T, climb)
-        assert v[0] + T * command.acceleration[0] == pytest.approx(
-            max(fastest, 0.3 - A_MAX * T), abs=1e-6)
+        assert v[0] + SPEED_TIME * command.acceleration[0] == pytest.approx(
+            max(fastest, 0.3 - A_MAX * SPEED_TIME), abs=1e-6)
         assert bool(command.reason) == (climb != 0.0)
+
+
+@pytest.mark.parametrize('pull', [[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
+def test_at_v_max_noise_of_the_velocity_is_not_a_command(pull: Vector) -> None:
+    """Within one period, errors of 0.02 m/s would be commands of 0.2 m/s^2."""
+    commands = [limit_horizontal(pull, 0.0, [V_MAX + error, 0.0, 0.0], A_MAX, V_MAX, T).acceleration
+                for error in np.linspace(-0.02, 0.02, 9)]
+    assert np.ptp(commands, axis=0).max() <= 0.04 / SPEED_TIME + 1e-6
+
+
+def test_at_v_max_cohesion_turns_the_velocity_within_speed_time() -> None:
+    """Within one period it would turn as hard as ``a_max`` permits, and back in the next one."""
+    beside = Bound([0.0, 1.0, 0.0], 20.0, COHESION)
+    command = keep_bounds([0.0] * 3, [V_MAX, 0.0, 0.0], [beside], A_MAX, V_MAX, T)
+    assert command.acceleration[1] == pytest.approx(V_MAX / SPEED_TIME, rel=0.01)
 
 
 @given(st.integers(0, 2 ** 32))
