@@ -47,7 +47,7 @@ COHESION_INSISTENCE = 10.0
 MIN_HORIZONTAL_SHARE = 0.1
 #: Time in which law and cohesion approach v_max, s: within one period, the noise of the velocity
 #: would be a command.
-SPEED_TIME = 0.4
+SPEED_TIME = 0.5
 
 
 class Bound(NamedTuple):
@@ -64,7 +64,8 @@ class Bound(NamedTuple):
 
 
 def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
-                     v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
+                     v_max: float, period: float, climb: float = 0.0,
+                     drag: ArrayLike = (0.0, 0.0, 0.0)) -> LimitedCommand:
     """
     Limit an acceleration whose vertical part has priority over the horizontal one.
 
@@ -76,6 +77,7 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     :param vertical: acceleration, m/s^2, at most ``a_max``.
     :param climb: vertical velocity, m/s, that the vertical part will reach; it is reserved in
         ``v_max``.
+    :param drag: acceleration (3,), m/s^2, that drag takes: to keep the speed, it is commanded.
     """
     v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
@@ -88,11 +90,12 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     # Above v_max already: the speed falls within SPEED_TIME, and does not grow in this period.
     most = max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
     left = math.sqrt(max(most ** 2 - float(v[2] + vertical * period) ** 2, 0.0))
-    for limit, time in ((fastest, max(SPEED_TIME, period)), (left, period)):
-        reached = v[:2] + horizontal * time
+    for limit, time, lost in ((fastest, max(SPEED_TIME, period), np.asarray(drag)[:2]),
+                              (left, period, np.zeros(2))):
+        reached = v[:2] + (horizontal - lost) * time
         target = limit_norm(reached, limit)
         if target.tolist() != reached.tolist():
-            horizontal = limit_norm((target - v[:2]) / time, strongest)
+            horizontal = limit_norm((target - v[:2]) / time + lost, strongest)
             reasons.append('v_max')
     command = limit_command([*horizontal.tolist(), vertical], v, a_max, most, period)
     binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
@@ -101,7 +104,7 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
 
 
 def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
-                v_max: float, period: float) -> LimitedCommand:
+                v_max: float, period: float, drag: ArrayLike = (0.0, 0.0, 0.0)) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.
 
@@ -120,6 +123,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: ego velocity (3,), m/s.
     :param required: the bounds, the most important first (see ``sort_bounds``).
+    :param drag: see :func:`limit_horizontal`.
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
     speed = math.hypot(*v.tolist())
@@ -141,8 +145,8 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
     vertical, strongest = requested[2], a_max * SENT_INSIDE
     left = math.sqrt(max(fastest ** 2 - (float(v[2]) + vertical * period) ** 2, 0.0))
-    within, smooth = ((complex(*(-v[:2] / time)), left / time)
-                      for time in (period, max(SPEED_TIME, period)))
+    within, smooth = ((complex(*(lost - v[:2] / time)), left / time) for time, lost in (
+        (period, np.zeros(2)), (max(SPEED_TIME, period), np.asarray(drag)[:2])))
     goal = complex(*limit_norm(a, SANE)[:2])
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
     cohesion = [k for k, side in enumerate(sides) if side[2] == COHESION]

@@ -168,8 +168,9 @@ def test_room_is_left_for_the_climb_that_is_coming() -> None:
 @pytest.mark.parametrize('pull', [[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
 def test_at_v_max_noise_of_the_velocity_is_not_a_command(pull: Vector) -> None:
     """Within one period, errors of 0.02 m/s would be commands of 0.2 m/s^2."""
-    commands = [limit_horizontal(pull, 0.0, [V_MAX + error, 0.0, 0.0], A_MAX, V_MAX, T).acceleration
-                for error in np.linspace(-0.02, 0.02, 9)]
+    speeds = np.linspace(V_MAX - 0.02, V_MAX + 0.02, 9)
+    commands = [limit_horizontal(pull, 0.0, [speed, 0.0, 0.0], A_MAX, V_MAX, T).acceleration
+                for speed in speeds]
     assert np.ptp(commands, axis=0).max() <= 0.04 / SPEED_TIME + 1e-6
 
 
