@@ -157,7 +157,7 @@ def test_the_altitude_goes_before_the_horizontal_pull() -> None:
 
 
 def test_room_is_left_for_the_climb_that_is_coming() -> None:
-    wanted, v = [0.5, 0.0, 0.0], [0.3, 0.0, 0.0]
+    wanted, v = [0.2 / SPEED_TIME, 0.0, 0.0], [0.3, 0.0, 0.0]
     for climb, fastest in ((0.0, 0.5), (0.3, 0.4), (-0.4, 0.3), (0.6, 0.0)):
         command = limit_horizontal(wanted, 0.0, v, A_MAX, V_MAX, T, climb)
         assert v[0] + SPEED_TIME * command.acceleration[0] == pytest.approx(
