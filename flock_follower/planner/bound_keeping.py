@@ -42,12 +42,12 @@ from flock_follower.planner.vectors import scalar_product
 # the same names are in ``flocking``.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 #: Factor by which the correction for cohesion beyond ``v_max`` counts: see ``keep_bounds``.
-COHESION_INSISTENCE = 10.0
+COHESION_INSISTENCE = 5.0
 #: Horizontal share of a bound's normal, below which no horizontal command helps.
 MIN_HORIZONTAL_SHARE = 0.1
 #: Time in which law and cohesion approach v_max, s: within one period, the noise of the velocity
 #: would be a command.
-SPEED_TIME = 0.5
+SPEED_TIME = 0.4
 
 
 class Bound(NamedTuple):
@@ -65,7 +65,7 @@ class Bound(NamedTuple):
 
 def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
                      v_max: float, period: float, climb: float = 0.0,
-                     drag: ArrayLike = (0.0, 0.0, 0.0)) -> LimitedCommand:
+                     drag: ArrayLike | None = None) -> LimitedCommand:
     """
     Limit an acceleration whose vertical part has priority over the horizontal one.
 
@@ -77,7 +77,8 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     :param vertical: acceleration, m/s^2, at most ``a_max``.
     :param climb: vertical velocity, m/s, that the vertical part will reach; it is reserved in
         ``v_max``.
-    :param drag: acceleration (3,), m/s^2, that drag takes: to keep the speed, it is commanded.
+    :param drag: acceleration (3,), m/s^2, that drag takes. With it, ``v_max`` is approached within
+        ``SPEED_TIME``; if None, within one period.
     """
     v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
@@ -88,10 +89,11 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     rising = max(abs(float(v[2]) + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
     # Above v_max already: the speed falls within SPEED_TIME, and does not grow in this period.
-    most = max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
+    most = v_max if drag is None else max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
     left = math.sqrt(max(most ** 2 - float(v[2] + vertical * period) ** 2, 0.0))
-    for limit, time, lost in ((fastest, max(SPEED_TIME, period), np.asarray(drag)[:2]),
-                              (left, period, np.zeros(2))):
+    for limit, time, lost in [(fastest, period, np.zeros(2))] if drag is None else [
+            (fastest, max(SPEED_TIME, period), np.asarray(drag)[:2]),
+            (left, period, np.zeros(2))]:
         reached = v[:2] + (horizontal - lost) * time
         target = limit_norm(reached, limit)
         if target.tolist() != reached.tolist():
@@ -123,7 +125,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: ego velocity (3,), m/s.
     :param required: the bounds, the most important first (see ``sort_bounds``).
-    :param drag: see :func:`limit_horizontal`.
+    :param drag: acceleration (3,), m/s^2, that drag takes: to keep the speed, it is commanded.
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
     speed = math.hypot(*v.tolist())

@@ -139,29 +139,31 @@ def test_braking_falls_with_the_time_constant_and_ends_at_rest() -> None:
 @pytest.mark.filterwarnings('ignore:overflow')
 def test_what_the_altitude_leaves_is_within_both_limits_too(a: Vector, vertical: float,
                                                             v: Vector) -> None:
-    command = limit_horizontal(a, vertical, v, A_MAX, V_MAX, T)
-    assert np.all(np.isfinite(command.acceleration))
-    assert np.linalg.norm(command.acceleration) <= A_MAX
-    speed = math.hypot(*v)
-    if speed < 100.0:
-        reached = np.linalg.norm(np.array(v) + command.acceleration * T)
-        assert reached <= max(V_MAX, speed * (1.0 + 1e-15))
+    for drag in (None, [0.1, -0.3, 0.0]):
+        command = limit_horizontal(a, vertical, v, A_MAX, V_MAX, T, drag=drag)
+        assert np.all(np.isfinite(command.acceleration))
+        assert np.linalg.norm(command.acceleration) <= A_MAX
+        speed = math.hypot(*v)
+        if speed < 100.0:
+            reached = np.linalg.norm(np.array(v) + command.acceleration * T)
+            assert reached <= max(V_MAX, speed * (1.0 + 1e-15))
 
 
-def test_the_altitude_goes_before_the_horizontal_pull() -> None:
+@pytest.mark.parametrize('drag', [None, [0.1, -0.3, 0.0]], ids=['at once', 'smoothly'])
+def test_the_altitude_goes_before_the_horizontal_pull(drag: Vector | None) -> None:
     v = np.array([V_MAX, 0.0, 0.0])
-    command = limit_horizontal([2.0, 0.0, 9.0], 1.0, v, A_MAX, V_MAX, T)
+    command = limit_horizontal([2.0, 0.0, 9.0], 1.0, v, A_MAX, V_MAX, T, drag=drag)
     assert command.acceleration[2] == pytest.approx(1.0)
     assert np.linalg.norm(v + T * command.acceleration) <= V_MAX
     assert command.reason == 'v_max'
 
 
 def test_room_is_left_for_the_climb_that_is_coming() -> None:
-    wanted, v = [0.2 / SPEED_TIME, 0.0, 0.0], [0.3, 0.0, 0.0]
+    wanted, v = [2.0, 0.0, 0.0], [0.3, 0.0, 0.0]
     for climb, fastest in ((0.0, 0.5), (0.3, 0.4), (-0.4, 0.3), (0.6, 0.0)):
         command = limit_horizontal(wanted, 0.0, v, A_MAX, V_MAX, T, climb)
-        assert v[0] + SPEED_TIME * command.acceleration[0] == pytest.approx(
-            max(fastest, 0.3 - A_MAX * SPEED_TIME), abs=1e-6)
+        assert v[0] + T * command.acceleration[0] == pytest.approx(
+            max(fastest, 0.3 - A_MAX * T), abs=1e-6)
         assert bool(command.reason) == (climb != 0.0)
 
 
@@ -169,8 +171,8 @@ def test_room_is_left_for_the_climb_that_is_coming() -> None:
 def test_at_v_max_noise_of_the_velocity_is_not_a_command(pull: Vector) -> None:
     """Within one period, errors of 0.02 m/s would be commands of 0.2 m/s^2."""
     speeds = np.linspace(V_MAX - 0.02, V_MAX + 0.02, 9)
-    commands = [limit_horizontal(pull, 0.0, [speed, 0.0, 0.0], A_MAX, V_MAX, T).acceleration
-                for speed in speeds]
+    commands = [limit_horizontal(pull, 0.0, [speed, 0.0, 0.0], A_MAX, V_MAX, T,
+                                 drag=[0.0] * 3).acceleration for speed in speeds]
     assert np.ptp(commands, axis=0).max() <= 0.04 / SPEED_TIME + 1e-6
 
 
