@@ -42,9 +42,12 @@ from flock_follower.planner.vectors import scalar_product
 # the same names are in ``flocking``.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 #: Factor by which the correction for cohesion beyond ``v_max`` counts: see ``keep_bounds``.
-COHESION_INSISTENCE = 10.0
+COHESION_INSISTENCE = 5.0
 #: Horizontal share of a bound's normal, below which no horizontal command helps.
 MIN_HORIZONTAL_SHARE = 0.1
+#: Time in which law and cohesion approach v_max, s: within one period, the noise of the velocity
+#: would be a command.
+SPEED_TIME = 0.4
 
 
 class Bound(NamedTuple):
@@ -61,7 +64,8 @@ class Bound(NamedTuple):
 
 
 def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
-                     v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
+                     v_max: float, period: float, climb: float = 0.0,
+                     drag: ArrayLike | None = None) -> LimitedCommand:
     """
     Limit an acceleration whose vertical part has priority over the horizontal one.
 
@@ -73,6 +77,8 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     :param vertical: acceleration, m/s^2, at most ``a_max``.
     :param climb: vertical velocity, m/s, that the vertical part will reach; it is reserved in
         ``v_max``.
+    :param drag: acceleration (3,), m/s^2, that drag takes. With it, ``v_max`` is approached within
+        ``SPEED_TIME``; if None, within one period.
     """
     v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
@@ -82,19 +88,25 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     reasons = [] if horizontal.tolist() == nominal[:2].tolist() else ['a_max']
     rising = max(abs(float(v[2]) + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
-    reached = v[:2] + horizontal * period
-    target = limit_norm(reached, fastest)
-    if target.tolist() != reached.tolist():
-        horizontal = limit_norm((target - v[:2]) / period, strongest)
-        reasons.append('v_max')
-    command = limit_command([*horizontal.tolist(), vertical], v, a_max, v_max, period)
+    # Above v_max already: the speed falls within SPEED_TIME, and does not grow in this period.
+    most = v_max if drag is None else max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
+    left = math.sqrt(max(most ** 2 - float(v[2] + vertical * period) ** 2, 0.0))
+    for limit, time, lost in [(fastest, period, np.zeros(2))] if drag is None else [
+            (fastest, max(SPEED_TIME, period), np.asarray(drag)[:2]),
+            (left, period, np.zeros(2))]:
+        reached = v[:2] + (horizontal - lost) * time
+        target = limit_norm(reached, limit)
+        if target.tolist() != reached.tolist():
+            horizontal = limit_norm((target - v[:2]) / time + lost, strongest)
+            reasons.append('v_max')
+    command = limit_command([*horizontal.tolist(), vertical], v, a_max, most, period)
     binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
     reason = ', '.join(binding) if 'finite' not in command.reason else command.reason
     return LimitedCommand(command.acceleration, reason)
 
 
 def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
-                v_max: float, period: float) -> LimitedCommand:
+                v_max: float, period: float, drag: ArrayLike = (0.0, 0.0, 0.0)) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.
 
@@ -113,6 +125,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: ego velocity (3,), m/s.
     :param required: the bounds, the most important first (see ``sort_bounds``).
+    :param drag: acceleration (3,), m/s^2, that drag takes: to keep the speed, it is commanded.
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
     (vx, vy, vz), requested = v.tolist(), a.tolist()
@@ -134,13 +147,14 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
         return limit_command(a, v, a_max, fastest, period)
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
     strongest = a_max * SENT_INSIDE
-    left, center = vz + vertical * period, complex(-vx / period, -vy / period)
-    within = center, math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
+    left = math.sqrt(max(fastest ** 2 - (vz + vertical * period) ** 2, 0.0))
+    within, smooth = ((complex(*(lost - v[:2] / time)), left / time) for time, lost in (
+        (period, np.zeros(2)), (max(SPEED_TIME, period), np.asarray(drag)[:2])))
     goal = complex(*limit_norm(a, SANE)[:2].tolist())
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
     cohesion = [k for k, side in enumerate(sides) if side[2] == COHESION]
     if cohesion:
-        _yield_cohesion(goal, bounds, cohesion, Discs(*within, *within), discs)
+        _yield_cohesion(goal, bounds, cohesion, Discs(*smooth, *smooth), discs)
     point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.

@@ -182,11 +182,11 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
     more = _lost_to_drag(memory, velocity, params)
     rising = max(abs(float(scene.me.velocity[2])), abs(climb))
     command = limit_horizontal(nominal, vertical, velocity, limits[0], limits[1] + more,
-                               params.period, rising)
+                               params.period, rising, memory.drag if params.guard else None)
     if params.guard and (scene.state is not State.SEARCH or memory.flock):
         bounds = _bounds(memory, scene, velocity, view, params)
         allowed = keep_bounds(command.acceleration, velocity, bounds, params.a_max,
-                              params.v_max + more, params.period)
+                              params.v_max + more, params.period, memory.drag)
         if start != lowered:
             clear = keep_bounds(allowed.acceleration, velocity, [
                 each for each in bounds if each.reason in (SEPARATION, FENCE)],

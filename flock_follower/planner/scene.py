@@ -32,6 +32,7 @@ import numpy as np
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.inputs import (
     find_newest,
+    MAX_ACCELERATION_AGE,
     Neighbor,
     OwnState,
     predict,
@@ -171,7 +172,9 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
     me, leader = scene.me, scene.leader
     if (scene.state is State.TRACK and leader is None) or memory.followed is None:
         return None
-    if memory.lost is None:
+    seen_at = -math.inf if scene.missed is None else scene.missed.stamp
+    if memory.lost is None or me.stamp - seen_at <= MAX_ACCELERATION_AGE:
+        # Seen again, if only for a moment: the retreat begins anew at the place that was seen.
         lost = _new_loss(memory, flock, scene, params)
     else:
         along = memory.lost.towards

@@ -25,7 +25,13 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.bound_keeping import limit_horizontal
+from flock_follower.planner.bound_keeping import (
+    Bound,
+    COHESION,
+    keep_bounds,
+    limit_horizontal,
+    SPEED_TIME,
+)
 from flock_follower.planner.limits import brake, limit_command, limit_norm, SENT_INSIDE
 
 A_MAX = 2.5
@@ -134,13 +140,15 @@ def test_braking_falls_with_the_time_constant_and_ends_at_rest() -> None:
 @pytest.mark.filterwarnings('ignore:overflow')
 def test_what_the_altitude_leaves_is_within_both_limits_too(a: Vector, vertical: float,
                                                             v: Vector) -> None:
-    command = limit_horizontal(a, vertical, v, A_MAX, V_MAX, T)
-    assert_within_limits(command.acceleration, v, A_MAX, V_MAX, T)
+    for drag in (None, [0.1, -0.3, 0.0]):
+        command = limit_horizontal(a, vertical, v, A_MAX, V_MAX, T, drag=drag)
+        assert_within_limits(command.acceleration, v, A_MAX, V_MAX, T)
 
 
-def test_the_altitude_goes_before_the_horizontal_pull() -> None:
+@pytest.mark.parametrize('drag', [None, [0.1, -0.3, 0.0]], ids=['at once', 'smoothly'])
+def test_the_altitude_goes_before_the_horizontal_pull(drag: Vector | None) -> None:
     v = np.array([V_MAX, 0.0, 0.0])
-    command = limit_horizontal([2.0, 0.0, 9.0], 1.0, v, A_MAX, V_MAX, T)
+    command = limit_horizontal([2.0, 0.0, 9.0], 1.0, v, A_MAX, V_MAX, T, drag=drag)
     assert command.acceleration[2] == pytest.approx(1.0)
     assert np.linalg.norm(v + T * command.acceleration) <= V_MAX
     assert command.reason == 'v_max'
@@ -153,6 +161,22 @@ def test_room_is_left_for_the_climb_that_is_coming() -> None:
         assert v[0] + T * command.acceleration[0] == pytest.approx(
             max(fastest, 0.3 - A_MAX * T), abs=1e-6)
         assert bool(command.reason) == (climb != 0.0)
+
+
+@pytest.mark.parametrize('pull', [[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
+def test_at_v_max_noise_of_the_velocity_is_not_a_command(pull: Vector) -> None:
+    """Within one period, errors of 0.02 m/s would be commands of 0.2 m/s^2."""
+    speeds = np.linspace(V_MAX - 0.02, V_MAX + 0.02, 9)
+    commands = [limit_horizontal(pull, 0.0, [speed, 0.0, 0.0], A_MAX, V_MAX, T,
+                                 drag=[0.0] * 3).acceleration for speed in speeds]
+    assert np.ptp(commands, axis=0).max() <= 0.04 / SPEED_TIME + 1e-6
+
+
+def test_at_v_max_cohesion_turns_the_velocity_within_speed_time() -> None:
+    """Within one period it would turn as hard as ``a_max`` permits, and back in the next one."""
+    beside = Bound([0.0, 1.0, 0.0], 20.0, COHESION)
+    command = keep_bounds([0.0] * 3, [V_MAX, 0.0, 0.0], [beside], A_MAX, V_MAX, T)
+    assert command.acceleration[1] == pytest.approx(V_MAX / SPEED_TIME, rel=0.01)
 
 
 @given(st.integers(0, 2 ** 32))

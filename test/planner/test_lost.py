@@ -42,6 +42,7 @@ from flock_follower.planner.retreat import (
     STOPPING_TIME,
 )
 from flock_follower.planner.scene import survey
+from flock_follower.planner.sight import FieldOfView
 
 AHEAD = np.array([2.0, 0.0, 0.0])
 
@@ -72,6 +73,23 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_warns() -> None:
     assert 'out of the way of a neighbor out of sight' in warned[-1][0]
     assert not warned[0]
     assert min(heights) > 2.0 - 0.01  # never descending
+
+
+def test_one_glimpse_of_an_occluded_leader_renews_the_retreat() -> None:
+    """One image is too few to follow again, but shows that the leader now comes nearer."""
+    follower, aside = lost(distance=1.5, closing=-0.3), math.radians(40.0)
+    view = FieldOfView(aside, aside, aside, aside),
+    for _ in range(80):
+        frames = [follower.now - 0.1 * k for k in (2, 1, 0)]
+        decision = follower.tick(frames=frames, view=view)
+    used = follower.position
+    assert decision.state is State.HOLD and np.linalg.norm(follower.velocity) < 0.02
+    ahead = used + np.array([1.5, 0.0, 0.0])
+    follower.tick(seen(follower.now, ahead, (-0.4, 0.0, 0.0)), frames=[follower.now], view=view)
+    for _ in range(12):
+        decision = follower.tick(view=view)
+    assert decision.state is not State.TRACK
+    assert follower.velocity[0] < -0.3
 
 
 @pytest.mark.parametrize(('retreat_max', 'looked'), [(0.0, None), (1.0, 0.7)],
