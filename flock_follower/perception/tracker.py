@@ -341,7 +341,8 @@ class Tracker:
         assert found.margin is not None
         if found.spacing is not None:
             return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
-        settled = found.doubt < SETTLED and expected.pose is not None and (
+        # Both attitudes in one, with a margin of 0, may part soon.
+        settled = found.margin > 0.0 and found.doubt < SETTLED and expected.pose is not None and (
             angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
         return SMEARED_EVERY - 1 if settled else 0
 
