@@ -228,6 +228,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     fits = [one for one in near
             if one.inlier_share > max(SHARP_INLIER_SHARE, min(
                 FOUND_INLIER_SHARE, 0.9 * max(each.inlier_share for each in near)))
+            and (most_rms == 1.0 or one.blur < PLAIN_BLUR)  # blurred, edges of clutter look alike
             and _find_shown(image, one).all()]
     if not fits:
         return None if not most_rms or any(map(_sharp, near)) else _without_edges(
