@@ -72,8 +72,7 @@ class AlikeErrors:
 def root_of(covariance: Array) -> Array:
     """Return the symmetric root (n, n) of a covariance (n, n); it changes continuously."""
     values, vectors = np.linalg.eigh(covariance)
-    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))).dot(vectors.T)
-    return root
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).dot(vectors.T))
 
 
 def scale_variances(covariance: Array, part: slice | Array, factor: float) -> Array:

@@ -82,8 +82,7 @@ class CameraMotion(NamedTuple):
     @property
     def turning(self) -> Array:
         """Return the ego angular velocity (3,), rad/s, in odom."""
-        turning: Array = self.rotation.dot(self.own.angular_velocity)
-        return turning
+        return np.asarray(self.rotation.dot(self.own.angular_velocity))
 
     def prior(self, estimate: Estimate | None) -> PosePrior:
         """Return the expected pose of a neighbor, given its estimate or None."""
@@ -279,7 +278,7 @@ class Look:
             if recent or found.margin is not None:  # both would take too long for one image
                 return found
             place, prior = found.T_camera_body, PosePrior(None, self.expected[name].up)
-            ids, corners = search.near(
+            ids, corners, _ = search.near(
                 image, self.model, dictionary, sought.neighbor, place, False)
             for index, marker in enumerate(sought.neighbor.markers):
                 middle = place.apply(marker.T_body_marker.translation)
@@ -287,7 +286,7 @@ class Look:
                     if not contradicts(
                             image, self.model, sought, index, outline, place, prior.up):
                         continue
-                    again = locate(image, self.model, sought, index, outline, prior, False)
+                    again = locate(image, self.model, sought, index, outline, prior, 0.0)
                     if again is not None and angle(again.T_camera_body, place) > MAX_TURN and (
                             math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),
                                       middle) < marker.side_length):

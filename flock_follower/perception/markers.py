@@ -46,10 +46,13 @@ class Detections(NamedTuple):
 
     ``ids`` (N,); ``corners`` (N, 4, 2), px, in the marker's own order top-left, top-right,
     bottom-right, bottom-left. A corner is the crossing of the outline's edges in a sharp image.
+    ``most_rms``: the largest of a fit to the print as a whole, as ``SmearFit`` has it; 0: it is
+    not to be fitted.
     """
 
     ids: NDArray[np.int64]
     corners: Array
+    most_rms: float = 1.0
 
 
 NO_DETECTIONS = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
@@ -107,8 +110,7 @@ def draw_marker(dictionary: str, marker_id: int, side_px: int) -> GrayImage:
     if side_px < cells:
         raise ValueError(f'side_px = {side_px}: must be at least {cells}, one per cell')
     draw = _cv_aruco.generateImageMarker if _MODERN else _cv_aruco.drawMarker
-    image: GrayImage = draw(book, marker_id, side_px)
-    return image
+    return np.asarray(draw(book, marker_id, side_px))
 
 
 @lru_cache(maxsize=64)
@@ -156,8 +158,7 @@ def outwards(corners: Array, by: float) -> Array:
     legs = [corners - np.roll(corners, k, axis=1) for k in (1, -1)]
     legs = [leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-9) for leg in legs]
     sine = np.abs(legs[0][..., 0] * legs[1][..., 1] - legs[0][..., 1] * legs[1][..., 0])
-    moved: Array = corners + by * (legs[0] + legs[1]) / np.maximum(sine, 0.2)[..., None]
-    return moved
+    return np.asarray(corners + by * (legs[0] + legs[1]) / np.maximum(sine, 0.2)[..., None])
 
 
 @lru_cache(maxsize=4)

@@ -84,5 +84,4 @@ def ellipse_pixels(camera: CameraModel, measurement: Measurement) -> Array:
     values, axes = np.linalg.eigh(np.nan_to_num(spread))
     angle = np.linspace(0.0, 2.0 * np.pi, 25)[:, None]
     circle = np.hstack([np.cos(angle), np.sin(angle)])
-    rim: Array = pixels + 2.0 * circle * np.sqrt(np.maximum(values, 0.0)) @ axes.T
-    return rim
+    return np.asarray(pixels + 2.0 * circle * np.sqrt(np.maximum(values, 0.0)) @ axes.T)

@@ -68,7 +68,8 @@ SIGMA_FLOOR = 0.05
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
-#: Of a marker that is not tracked yet, more than this share of the edges must agree.
+#: Of a marker that is not tracked yet, more than this share of the edges must agree; if something
+#: covers it, SHARP_INLIER_SHARE.
 FOUND_INLIER_SHARE = 0.8
 #: If more than this share of the edges agrees, to within SHARP_RMS, none of them is smeared: if
 #: the code is not shown, either they are not of the marker, or something covers it.
@@ -92,6 +93,9 @@ MAX_TURN = 0.3
 MAX_STEPS = 9
 #: Most steps of a fit from the smear of the last image, before smear and place are searched for.
 AS_BEFORE_STEPS = 6
+#: Longest smear of a print whose code was not read, a share of the side of the code: with more,
+#: another print may look alike.
+MAX_UNREAD_SMEAR = 0.55
 #: Number of independent samples of a smeared print, to decide between two attitudes. Most of the
 #: residuals are errors of the model, which are alike for neighboring samples.
 EFFECTIVE_SMEAR_SAMPLES = 40.0
@@ -139,7 +143,8 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     # The other edges may be out of reach.
     if found is not None and found.inlier_share < PLAIN_INLIER_SHARE:
         again = fit(image, camera, found.lines.model, found.pose)
-        found = again if again is not None and again.inlier_share > found.inlier_share else found
+        if (spacing is not None) if again is None else again.inlier_share > found.inlier_share:
+            found = again
     blurred = found is not None and found.blur > RUN_TOGETHER and (
         len(found.lines.model.codes) == 1)
     if whole is None and blurred:
@@ -212,21 +217,24 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: PosePrior, smeared: bool = True) -> Measurement | None:
+           expected: PosePrior, most_rms: float = 1.0) -> Measurement | None:
     """
     Return a neighbor with a detected marker, or None if no pose fits the marker.
 
     :param index: of the marker among the neighbor's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
-    :param smeared: whether to fit the print as a whole if its edges are smeared.
+    :param most_rms: of a fit to the print as a whole if its edges are smeared, see ``Detections``.
     """
     alone, starts = _starts_of(camera, sought, index, corners)
     near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
     fits = [one for one in near
-            if one.inlier_share > FOUND_INLIER_SHARE and _find_shown(image, one).all()]
+            if one.inlier_share > max(SHARP_INLIER_SHARE, min(
+                FOUND_INLIER_SHARE, 0.9 * max(each.inlier_share for each in near)))
+            and (most_rms == 1.0 or one.blur < PLAIN_BLUR)  # blurred, edges of clutter look alike
+            and _find_shown(image, one).all()]
     if not fits:
-        return None if not smeared or any(map(_sharp, near)) else _without_edges(
-            image, camera, sought, index, starts, expected)
+        return None if not most_rms or any(map(_sharp, near)) else _without_edges(
+            image, camera, sought, index, starts, expected, most_rms)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * DEVIATION_FACTOR)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit
@@ -270,11 +278,14 @@ def contradicts(image: GrayImage, camera: CameraModel, sought: Target, index: in
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-                   starts: list[Transform], expected: PosePrior) -> Measurement | None:
+                   starts: list[Transform], expected: PosePrior,
+                   most_rms: float) -> Measurement | None:
     """Return a neighbor by the whole print of a detected marker, smeared."""
     for start in starts:
         found = fit_smeared(image, camera, sought.smears[index], start)
-        if found is not None:
+        if found is not None and found.rms < most_rms and (
+                most_rms == 1.0 or found.smear.dot(found.smear) < (
+                    MAX_UNREAD_SMEAR * (sought.smears[index].cells - 2))**2):
             return _of_smears(image, camera, sought, _Whole(index, found), expected, None, True)
     return None
 
@@ -436,8 +447,9 @@ def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
 
 
 def _scale(found: EdgeFit) -> float:
-    """Return the factor on its variances."""
-    return max(found.chi2, 1.0) * DEVIATION_FACTOR**2
+    """Return the factor on its variances: what covers edges moves those beside."""
+    uncovered = min(found.inlier_share / PLAIN_INLIER_SHARE, 1.0)
+    return max(found.chi2, 1.0) * (DEVIATION_FACTOR / uncovered)**2
 
 
 def _mirrored_hypotheses(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:

@@ -127,6 +127,7 @@ _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
 _MAX_EXCESS = 3.0
 _MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
 _MOST_HIDDEN_TRACKED = 0.4  # share of the inner cells of a tracked marker that a reflex may hide
+_MIN_COVERED = 4  # of the white cells around, near an inner cell: along a side are five
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
@@ -139,9 +140,10 @@ class CellCode:
     and rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread.
     ``others`` (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells
     that are compared with each other under uneven light. ``beside`` (b, c): 1 for the cells next
-    to an inner cell. ``distinct``: the least number of edge points between cells of different
-    colors that are none in another word. ``by_cell`` converts pixels (c, 2) to the distances
-    between cells along rows and columns, px, (2, c).
+    to an inner cell; ``outside`` (b, a): 1 for the white cells around next but one to an inner
+    cell. ``distinct``: the least number of edge points between cells of different colors that are
+    none in another word. ``by_cell`` converts pixels (c, 2) to the distances between cells along
+    rows and columns, px, (2, c).
     """
 
     def __init__(self, marker: Marker, dictionary: str) -> None:
@@ -166,6 +168,7 @@ class CellCode:
             np.ones(len(order) - self.bits.size - self.border, dtype=bool)]))
         apart = np.abs(self.grid[:self.bits.size, None] - self.grid).max(axis=2)
         self.beside: Any = (apart == 1).astype(np.float32)
+        self.outside: Any = (apart[:, self.bits.size + self.border:] == 2).astype(np.float32)
         points = np.array([place[:2] for place, *_ in _edges(
             marker_code(dictionary, marker.marker_id))])
         beside = np.hypot(points[:, :1] - x, points[:, 1:] - y).argsort(axis=1)[:, :2]
@@ -198,8 +201,15 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = 
         return False
     middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
     cells = np.minimum(np.maximum((brightness[:inner] - middle) * (1.0 / half), -1.0), 1.0)
+    agreeing = cells * code.bits
+    # What covers the white around, darkly, covers cells beside.
+    covered = (np.maximum(cells, agreeing) < 0.0) & (
+        code.outside.dot(brightness[inner + code.border:] < middle) >= (
+            1 if tracked else _MIN_COVERED))
+    if np.count_nonzero(covered) <= code.errors:
+        cells[covered], agreeing[covered] = 0.0, 1.0
     if (np.count_nonzero(border < middle) >= _MIN_BORDER * code.border
-            and _few_wrong(cells * code.bits, brightness, code, tracked)
+            and _few_wrong(agreeing, brightness, code, tracked)
             and _is_word(cells, code)):
         return True
     shown, excess = _compare_in_uneven_light(brightness[None], code, tracked)

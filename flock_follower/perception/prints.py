@@ -129,9 +129,8 @@ def lean(R_camera_body: Array, up: Array) -> float:
 
 def mounted_turned(marker: Marker, quarters: int) -> Array:
     """Return the rotation (3, 3) of a marker on its body, turned left by some quarter turns."""
-    turned: Array = marker.T_body_marker.rotation @ rotation_vector_to_matrix(
-        [0.0, 0.0, 0.5 * math.pi * quarters])
-    return turned
+    return np.asarray(marker.T_body_marker.rotation @ rotation_vector_to_matrix(
+        [0.0, 0.0, 0.5 * math.pi * quarters]))
 
 
 def turned_print(pose: Transform, up: Array | None, marker: Marker) -> Fault | None:

@@ -15,8 +15,8 @@
 """
 Fits the pose of a marker that motion has blurred so much that its edges overlap.
 
-If a camera or a marker moves by up to one and a half cells during the exposure, the image has no
-sharp edges. But the effect of motion is known: each point of the image is the mean over a line in
+If a camera or a marker moves by one to three cells during the exposure, the image has no sharp
+edges. But the effect of motion is known: each point of the image is the mean over a line in
 the print. So the print, blurred along a vector, is compared with the image: first at several
 places and for several vectors; then, from the best of them, Gauss-Newton refines the pose, the
 vector and the camera's response to light.
@@ -59,7 +59,7 @@ _LENS_BLUR = 0.75
 #: White beyond the black border, at least, cells.
 _WHITE_AROUND = 0.8
 #: Longest smear by motion, cells.
-_MAX_SMEAR = 2.4
+_MAX_SMEAR = 3.2
 #: Least correlation of image and print from which to descend.
 _MIN_LIKENESS = 0.7
 #: Correlation by which a defocused print must win.
@@ -203,8 +203,7 @@ def _likeness(brightness: Array, model: SmearModel) -> Array:
     mean = patches.mean(axis=1)
     spread = np.einsum('ps,ps->p', patches, patches) - side * side * mean * mean
     # A smeared print has mean 0 and norm 1.
-    found: Array = patches.dot(model.smeared.T) / np.sqrt(np.maximum(spread, 1.0))[:, None]
-    return found
+    return np.asarray(patches.dot(model.smeared.T) / np.sqrt(np.maximum(spread, 1.0))[:, None])
 
 
 class _Seen(NamedTuple):

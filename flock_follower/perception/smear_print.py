@@ -63,7 +63,9 @@ N_FOCUSED = 3
 _ASSUMED_LENS = 1
 #: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees. None is 0,
 #: where the squares have no slope by the vector and the descent stays.
-_LENGTHS = (0.2, 0.5, 1.0, 1.45)
+_LENGTHS = (0.2, 0.5, 1.0, 1.55, 2.2)
+#: Number of these vectors, the shortest, that leave edges.
+N_SHARP = 4
 
 
 class SmearModel:
@@ -78,10 +80,11 @@ class SmearModel:
     of a cell. ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right
     and down, for each of :data:`LENS_BLURS`. ``smears`` (t, 2), cells, are the vectors tried
     first, with blur ``lenses`` (t,); ``smeared`` (t, s) are the samples with this smear, of mean 0
-    and norm 1. ``bits`` (b,), 0..1, are the inner cells. ``flips`` (w, b) is 1 for each cell in
-    which another codeword, in any rotation, differs from ``bits``. Up to ``errors`` cells may be
-    misread: half of the number that can be corrected. ``cells`` is the number of cells along a
-    side, with the black border.
+    and norm 1. ``by_cell`` (4 t, c): whiteness of the cells and of those around, likewise, turned
+    left by 0 to 3 quarters. ``bits`` (b,), 0..1, are the inner cells. ``flips`` (w, b) is 1 for
+    each cell in which another codeword, in any rotation, differs from ``bits``. Up to ``errors``
+    cells may be misread: half of the number that can be corrected. ``cells`` is the number of
+    cells along a side, with the black border.
     """
 
     def __init__(self, marker: Marker, dictionary: str) -> None:
@@ -117,6 +120,11 @@ class SmearModel:
         self.smeared -= self.smeared.mean(axis=1, keepdims=True)
         self.smeared /= np.linalg.norm(self.smeared, axis=1, keepdims=True)
         self.smeared = self.smeared.astype(np.float32)
+        middles = np.mgrid[-1:n + 1, -1:n + 1][::-1].reshape(2, -1) + 0.5 + _WHITE_CELLS
+        self.by_cell = np.array([
+            np.rot90(smear_print(self.printed[lens], (middles * _TEXELS_PER_CELL - 0.5).astype(
+                np.float32), smear, LENS_BLURS[lens])[0][0].reshape(n + 2, -1), turn).ravel()
+            for lens, smear in zip(self.lenses, self.smears) for turn in range(4)])
         code = cell_code(marker, dictionary)
         self.bits = 0.5 + 0.5 * code.bits.astype(float)
         self.flips = np.abs(0.5 * (code.others - code.bits)).astype(float)

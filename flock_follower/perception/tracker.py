@@ -341,7 +341,8 @@ class Tracker:
         assert found.margin is not None
         if found.spacing is not None:
             return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
-        settled = found.doubt < SETTLED and expected.pose is not None and (
+        # Both attitudes in one, with a margin of 0, may part soon.
+        settled = found.margin > 0.0 and found.doubt < SETTLED and expected.pose is not None and (
             angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
         return SMEARED_EVERY - 1 if settled else 0
 
@@ -365,6 +366,7 @@ class Tracker:
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbors that are not measured yet."""
         camera, dictionary = look.camera, self.config.dictionary
+        camera.portion = camera.portion if look.missing else 0
         due = self._schedule.search_due(camera, look.stamp)
         for thorough in (False, True):
             for name in [n for n in look.near if n not in look.measured and (
@@ -372,8 +374,11 @@ class Tracker:
                 pose = look.expected[name].pose
                 if pose is not None and not (thorough and due and camera.searched_near):
                     look.sighting.stage = 'roi'
+                    # In turns, for smeared and covered markers and for others.
+                    smeared = name in camera.measured and camera.measured[name].smear is not None
                     self._locate(search.near(image, look.model, dictionary,
-                                             self._targets[name].neighbor, pose, thorough),
+                                             self._targets[name].neighbor, pose, thorough,
+                                             thorough and (camera.portion % 2 > 0) != smeared),
                                  'roi', image, look)
         # Unless images are rare, one has time for a thorough search near by, or for a portion.
         near = any(look.expected[name].pose is not None for name in look.missing
@@ -410,7 +415,7 @@ class Tracker:
                 expected.pose is None) else None
             measurement = None if fault else locate(
                 image, look.model, self._targets[name], neighbor.markers.index(marker), corners,
-                expected)
+                expected, found.most_rms)
             if measurement is not None:
                 fault = prints.turned_print(measurement.T_camera_body, expected.up, marker)
             if fault is not None:

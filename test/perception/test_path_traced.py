@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The first images of path-traced flights, smeared: the attitude is not the mirrored one."""
+"""The first images of path-traced flights: found though covered or smeared, and not mirrored."""
 
 from __future__ import annotations
 
@@ -81,3 +81,26 @@ def test_smeared_first_image_does_not_lock_mirrored_attitude(
             off.append(angle(estimate.pose, Transform(attitude.as_matrix()[0])))
     assert max(off[1:]) < math.radians(20.0)
     assert max(off[4:]) < math.radians(5.0)
+
+
+@pytest.mark.parametrize(('name', 'effect'), [
+    *((name, 'finger') for name in ('room_hover', 'room_tag', 'room_hd')),
+    ('room_hover', 'blur2'), ('room_hd', 'blur2'), ('room_tag', 'blur15')])
+def test_covered_or_smeared_leader_is_measured_in_0_3_s(name: str, effect: str) -> None:
+    motion_of, tool = load_module(DATA / 'traj.py'), load_module(DATA / 'bag.py')
+    flight = motion_of.flight(name)
+    own, time, random = flight['F'], flight['t'], np.random.default_rng(1)
+    camera, tracker = camera_of(flight), tracker_of(flight)
+    with np.load(DATA / f'{name}.npz') as file:
+        ends, stamps = np.cumsum(file['sizes']), file['stamps'].tolist()
+        for k, stamp in enumerate(stamps):
+            assert stamp - stamps[0] < 0.3, 'not measured'
+            for at in np.arange(stamp - 0.05, stamp + 0.011, 0.01):
+                tracker.feed_odometry(OdometrySample(
+                    at, motion_of.at(time, own['p'], at)[0],
+                    motion_of.rot_at(time, own['R'], at).as_quat()[0],
+                    motion_of.vel(time, own['p'], at)[0], motion_of.rate(time, own['R'], at)[0]))
+            light = tool.effect(effect, light_of(file['jpg'], ends, k), k, stamp, flight, random)
+            image = tool.sensor(light, 1.5, 10000.0, 8.0, random)
+            if tracker.process_image(stamp, image, camera).estimates:
+                break

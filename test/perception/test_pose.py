@@ -303,7 +303,7 @@ def test_edges_alike_but_for_two_do_not_show_the_code(another: bool) -> None:
 def test_covered_marker_with_sharp_edges_is_not_fitted_as_smear(
         monkeypatch: pytest.MonkeyPatch) -> None:
     marker, fits = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05)), list[Any]()
-    image = render(SMALL, {0: marker}, cover=Cover('bottom', 0.4, 110.0), noise=10.0)
+    image = render(SMALL, {0: marker}, cover=Cover('bottom', 0.5, 110.0), noise=10.0)
     monkeypatch.setattr(pose_module, 'descend', lambda *start: fits.append(start))
     assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, True) is None
     assert not fits

@@ -19,7 +19,7 @@ from __future__ import annotations
 from functools import cache
 
 import cv2
-from marker_images import DICTIONARY, facing, make_camera, render, SIDE
+from marker_images import Cover, DICTIONARY, facing, make_camera, render, SIDE
 import numpy as np
 import pytest
 
@@ -29,6 +29,8 @@ from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
+from flock_follower.perception.measurement import Measurement, PosePrior
+from flock_follower.perception.pose import locate, target
 
 LEADER = MarkedNeighbor('leader', (Marker(3, SIDE, Transform()),))
 CAMERA = make_camera()
@@ -134,3 +136,44 @@ def test_a_thorough_search_reads_a_marker_in_uneven_light(kind: str, least: int)
         found.append(detections.ids.tolist() == [3] and np.abs(
             detections.corners[0] - corners_of(CAMERA, pose)).max() < 3.0)
     assert sum(found) >= least
+
+
+def located(image: GrayImage, markers: tuple[Marker, ...]) -> list[Measurement]:
+    """Return what an image shows of smeared or covered markers, each of its own neighbor."""
+    found = search.everywhere(image, DICTIONARY, markers, windows=())
+    sought = {m.marker_id: target(MarkedNeighbor('leader', (m,)), DICTIONARY) for m in markers}
+    poses = [locate(image, CAMERA, sought[marker_id], 0, corners, PosePrior(), found.most_rms)
+             for marker_id, corners in zip(found.ids.tolist(), found.corners)]
+    return [pose for pose in poses if pose is not None]
+
+
+#: Covers, and the motion of the image, px; a cell has 10 px.
+DISTURBED = [
+    *((Cover(side, 0.2, 20.0), (0.0, 0.0)) for side in ('left', 'right', 'top', 'bottom')),
+    (None, (18.0, 0.0)), (None, (12.0, 13.0)), (None, (0.0, -18.0))]
+
+
+@pytest.mark.parametrize(('cover', 'motion'), DISTURBED)
+def test_marker_with_covered_side_or_smeared_code_is_located(
+        cover: Cover | None, motion: tuple[float, float]) -> None:
+    image = render(CAMERA, {3: HERE}, cover=cover, motion=motion)
+    assert not len(search.everywhere(image, DICTIONARY).ids)
+    first, *_ = located(image, LEADER.markers)
+    error = first.T_camera_body.translation - HERE.translation
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(HERE.translation)
+
+
+@pytest.mark.parametrize(('cover', 'motion'), DISTURBED)
+@pytest.mark.parametrize('shown', [3, 17])
+def test_covered_or_smeared_marker_is_located_as_no_other(
+        shown: int, cover: Cover | None, motion: tuple[float, float]) -> None:
+    others = tuple(Marker(k, SIDE, Transform()) for k in range(50) if k != shown)
+    assert not located(render(CAMERA, {shown: HERE}, cover=cover, motion=motion), others)
+
+
+def test_code_that_resembles_clutter_is_not_sought_if_smeared() -> None:
+    """One white square: random textures and other smeared prints were taken for it."""
+    image = render(CAMERA, {17: HERE}, motion=(18.0, 0.0))
+    plain = (Marker(17, SIDE, Transform()),)
+    assert not len(search.everywhere(image, DICTIONARY, plain, windows=()).ids)
+    assert located(image, LEADER.markers) == []
