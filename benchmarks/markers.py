@@ -49,8 +49,8 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.neighbors_file import Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.parameters.neighbors_file import Marker, NeighborConfig
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.markers import draw_marker, marker_cells, parse

@@ -77,8 +77,8 @@ from flock_follower.messages import (
     OdometryState,
     stamp_to_nanoseconds,
 )
-from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.buffer import OdometryBuffer
+from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import compute_in_one_thread, GrayImage

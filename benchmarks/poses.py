@@ -30,9 +30,9 @@ import numpy as np
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
 from flock_follower.messages import from_odometry, NANOSECONDS
+from flock_follower.messages.poses import from_pose, pose_topic
 from flock_follower.odometry.buffer import interpolate, OdometrySample
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pose_messages import from_pose, pose_topic
 
 FIGURES = ('count', 'position_rms_m', 'attitude_rms_rad', 'nees_position', 'nees_attitude')
 

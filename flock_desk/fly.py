@@ -78,7 +78,7 @@ from flock_desk.runs.summary import (
 )
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEED_RANGE
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
-from flock_follower.bridge_state import TAKEN_OVER
+from flock_follower.messages.bridge_state import TAKEN_OVER
 from flock_follower.ranges import Range
 from flock_follower.whole_file import whole_file
 

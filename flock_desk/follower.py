@@ -36,8 +36,6 @@ import math
 from types import MappingProxyType
 from typing import Any, Final
 
-from flock_follower.acceleration_messages import ACCELERATION, from_acceleration, with_acceleration
-from flock_follower.command_messages import Command, from_trajectory, TRAJECTORY, trajectory
 from flock_follower.flock.exchange import Sharing
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
@@ -54,6 +52,13 @@ from flock_follower.messages import (
     STATE,
     to_nanoseconds,
 )
+from flock_follower.messages.accelerations import (
+    ACCELERATION,
+    from_acceleration,
+    with_acceleration,
+)
+from flock_follower.messages.commands import Command, from_trajectory, TRAJECTORY, trajectory
+from flock_follower.messages.poses import POSE, PoseState, RangeState
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver
 from flock_follower.perception.pose_sources import Sourced
@@ -64,7 +69,6 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
-from flock_follower.pose_messages import POSE, PoseState, RangeState
 
 
 @dataclass

@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_desk.runs.console import guarded
-from flock_follower.neighbors_file import SIDE_LENGTHS
+from flock_follower.parameters.neighbors_file import SIDE_LENGTHS
 from flock_follower.perception.markers import dictionary_size, draw_marker, marker_cells
 from flock_follower.ranges import Range
 from flock_follower.whole_file import whole_file

@@ -62,10 +62,10 @@ from flock_desk.sensors.vio import Odometry
 from flock_desk.simulator_outputs import LATCHED_QOS, ODOMETRY, SimulatorOutputs, VehicleAhead
 from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.bags.live_line import LiveLine
-from flock_follower.bridge_state import ACTIVE, NO_AUTOPILOT
 from flock_follower.checks.processor import children, LoadMeter
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import ID_RANGE
+from flock_follower.messages.bridge_state import ACTIVE, NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.runtime import FlockNode

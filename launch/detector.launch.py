@@ -26,8 +26,8 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from flock_follower.neighbors_file import load
 from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_arguments
+from flock_follower.parameters.neighbors_file import load
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of every topic'),

@@ -22,13 +22,13 @@ import numpy as np
 import pytest
 
 from flock_desk.vehicles.embedded import STEP_TIME
-from flock_follower.command_messages import Command
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.velocity_check import MotionReport
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.messages import OdometryState
+from flock_follower.messages.commands import Command
 
 PERIOD = 5  # steps of a cycle: 20 Hz
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])

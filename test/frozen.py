@@ -48,12 +48,12 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.metrics import measure
 from flock_desk.scenarios.scenario_file import load
-from flock_follower.command_messages import Command
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.velocity_check import MotionReport
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.messages import OdometryState
+from flock_follower.messages.commands import Command
 
 FOLDER = Path(__file__).resolve().parent / 'frozen'
 SCENARIOS = ('hover', 'straight', 'stop', 'circle', 'figure_eight', 'toward', 'random_walk',

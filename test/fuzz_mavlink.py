@@ -37,7 +37,6 @@ from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase, TAKEOVER_TIME
@@ -48,6 +47,7 @@ from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.messages import OdometryState
+from flock_follower.messages.commands import Command
 
 AUTOPILOT = ('127.0.0.1', 14580)
 PEERS = (AUTOPILOT, AUTOPILOT, AUTOPILOT, ('127.0.0.1', 9), 'serial')

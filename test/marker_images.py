@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception import markers
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage

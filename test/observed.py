@@ -53,9 +53,9 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
 )
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
+from flock_follower.messages.topic_names import names_there, OURS, TYPES
 from flock_follower.parameters.files import read_parameters
 from flock_follower.perception.camera import CameraModel
-from flock_follower.topic_names import names_there, OURS, TYPES
 
 START = 1_700_000_000.0  # s
 SECONDS = 5.0

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.tracker import camera_mounting, Tracker
 

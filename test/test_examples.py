@@ -130,7 +130,7 @@ def test_the_other_detector_finds_the_leader_and_is_short(ros: None) -> None:
     from flock_desk.camera.renderer import T_BODY_OPTICAL
     from flock_desk.closed_loop.real_time_flight import calibration, real_time_camera
     from flock_follower.geometry import quaternion_from_yaw, Transform
-    from flock_follower.pose_messages import from_pose
+    from flock_follower.messages.poses import from_pose
     camera = real_time_camera(0, dictionary='DICT_APRILTAG_36h11')
     leader = Transform.from_quaternion([2.0, 0.2, 1.0], quaternion_from_yaw(0.4))
     own = Transform.from_quaternion([0.0, 0.0, 1.0], quaternion_from_yaw(0.0)) @ T_BODY_OPTICAL

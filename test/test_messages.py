@@ -22,9 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from flock_follower.acceleration_messages import acceleration, from_acceleration
 from flock_follower.bags.message_types import empty
-from flock_follower.command_messages import Command, from_trajectory, trajectory
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import (
     from_odometry,
@@ -36,6 +34,8 @@ from flock_follower.messages import (
     SANE,
     stamp_age,
 )
+from flock_follower.messages.accelerations import acceleration, from_acceleration
+from flock_follower.messages.commands import Command, from_trajectory, trajectory
 from flock_follower.odometry.reader import OdometrySource
 
 

@@ -36,66 +36,51 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
 #: Modules beside the folders that every room may import.
-SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals', 'whole_file'}
+SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'signals', 'whole_file'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
-    'acceleration_messages': ('messages', 'numpy'),
-    'command_messages': ('messages', 'numpy'),
-    'pose_messages': ('messages', 'numpy'),
     'flocking': ('', 'numpy'),
     # NED is inside what speaks MAVLink.
     'ned': ('', 'numpy'),
-    'bridge_state': ('', ''),
-    'topic_names': ('command_messages messages', ''),
-    # The markers by name and size alone: the planner reads the file, too.
-    'neighbors_file': ('', 'yaml'),
     'odometry': ('messages', 'numpy'),
     # Tables, defaults and ranges stand with what they are for.
     'parameters': ('odometry', 'yaml'),
     'flock': ('flocking messages', 'numpy'),
-    'planner': ('acceleration_messages bridge_state command_messages flock flocking messages '
-                'neighbors_file odometry parameters', 'numpy'),
-    'perception': ('acceleration_messages messages neighbors_file odometry parameters '
-                   'pose_messages', 'cv2 numpy'),
+    'planner': ('flock flocking messages odometry parameters', 'numpy'),
+    'perception': ('messages odometry parameters', 'cv2 numpy'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
-    'gate': ('bridge_state command_messages messages planner', 'numpy'),
-    'mavlink': ('bridge_state gate messages ned odometry parameters', 'numpy pymavlink'),
+    'gate': ('messages planner', 'numpy'),
+    'mavlink': ('gate messages ned odometry parameters', 'numpy pymavlink'),
     'bags': ('parameters', 'backports compression mcap numpy rosbags yaml'),
     'flight_parameters': ('mavlink parameters perception planner', ''),
-    'checks': ('bags bridge_state messages neighbors_file odometry parameters perception '
-               'pose_messages topic_names', 'cv2 numpy'),
-    'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
-    'follow': ('bridge_state check checks nodes', ''),
+    'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
+    'check': ('bags checks flight_parameters messages nodes parameters', ''),
+    'follow': ('check checks messages nodes', ''),
     # The page of a flight, without ROS: what it shows, and its server.
-    'view': ('bridge_state command_messages messages odometry parameters perception planner',
+    'view': ('messages odometry parameters perception planner',
              'aiohttp cv2 numpy'),
-    'support': ('bridge_state gate mavlink messages odometry parameters perception '
-                'pose_messages', 'ROS numpy'),
-    'nodes': ('acceleration_messages bags bridge_state checks command_messages flock gate '
-              'mavlink messages neighbors_file odometry parameters perception planner '
-              'pose_messages support topic_names view',
+    'support': ('gate mavlink messages odometry parameters perception', 'ROS numpy'),
+    'nodes': ('bags checks flock gate mavlink messages odometry parameters perception planner '
+              'support view',
               'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('ned', 'numpy pymavlink'),
     'external': ('mavlink ned', 'numpy pymavlink'),
-    'scenarios': ('flocking planner', 'numpy yaml'),
+    'scenarios': ('flocking parameters planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'follower': ('acceleration_messages command_messages flock gate messages perception planner '
-                 'pose_messages', ''),
+    'follower': ('flock gate messages perception planner', ''),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('acceleration_messages camera external flock flocking '
-                    'follower gate mavlink messages neighbors_file odometry perception planner '
-                    'pose_messages scenarios sensors vehicles', 'numpy'),
+    'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
+                    'parameters perception planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
-    'runs': ('bags camera checks closed_loop command_messages flocking flocks follower gate '
-             'mavlink messages neighbors_file odometry parameters perception planner '
-             'pose_messages scenarios topic_names',
+    'runs': ('bags camera checks closed_loop flocking flocks follower gate mavlink messages '
+             'odometry parameters perception planner scenarios',
              'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
-    'flock_desk': ('bags bridge_state camera checks closed_loop external flight_parameters '
-                   'flocks mavlink messages neighbors_file nodes parameters perception '
-                   'planner runs scenarios sensors support topic_names vehicles',
+    'flock_desk': ('bags camera checks closed_loop external flight_parameters flocks mavlink '
+                   'messages nodes parameters perception planner runs scenarios sensors support '
+                   'vehicles',
                    'ROS cv2 matplotlib numpy'),
 }
 
@@ -109,11 +94,18 @@ FLIES = {
 _ALL_LOAD = 'messages nodes odometry parameters support'
 #: The rooms that each of them loads.
 LOADED_ROOMS = {
-    'relative_pose': f'acceleration_messages neighbors_file perception pose_messages {_ALL_LOAD}',
-    'planner': 'acceleration_messages bridge_state command_messages flock flocking '
-               f'neighbors_file planner {_ALL_LOAD}',
-    'mavlink_bridge': f'bridge_state command_messages gate mavlink ned planner {_ALL_LOAD}',
+    'relative_pose': f'perception {_ALL_LOAD}',
+    'planner': f'flock flocking planner {_ALL_LOAD}',
+    'mavlink_bridge': f'gate mavlink ned planner {_ALL_LOAD}',
     'flock': f'flock {_ALL_LOAD}',
+}
+#: The messages that each of them loads, beside odometry, and whether the file of the neighbors:
+#: the markers by name and size alone.
+LOADED_PARTS = {
+    'relative_pose': 'accelerations neighbors_file poses',
+    'planner': 'accelerations bridge_state commands neighbors_file',
+    'mavlink_bridge': 'bridge_state commands',
+    'flock': '',
 }
 #: What the gate needs of the planner.
 LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',
@@ -252,6 +244,14 @@ def test_a_node_that_flies_loads_only_the_libraries_it_may(node):
 def test_a_flight_node_loads_only_the_rooms_of_its_work(node):
     rooms = {read_house()[name].room for name in loaded(f'flock_follower.nodes.{node}')}
     assert rooms - SHARED - {'flock_follower'} == {*LOADED_ROOMS[node].split()}
+
+
+@pytest.mark.parametrize('node', FLIES)
+def test_a_flight_node_loads_only_the_messages_of_its_work(node):
+    parts = {name.rpartition('.')[2] for name in loaded(f'flock_follower.nodes.{node}')
+             if name.startswith('flock_follower.messages.')
+             or name == 'flock_follower.parameters.neighbors_file'}
+    assert parts == {*LOADED_PARTS[node].split()}
 
 
 def test_the_bridge_loads_only_the_limits_of_the_planner():

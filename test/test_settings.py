@@ -24,11 +24,7 @@ import pytest
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.mavlink.parameter_table import gate_limits
-from flock_follower.parameters.spec import specs_of
-from flock_follower.planner.parameter_table import planner_params
-from flock_follower.planner.params import PlannerParams
-from flock_follower.ranges import A_MAX, V_MAX
-from flock_follower.settings import (
+from flock_follower.parameters.settings import (
     Camera,
     find_unsafe_settings,
     NARROWEST,
@@ -36,6 +32,10 @@ from flock_follower.settings import (
     refuse,
     UNKNOWN,
 )
+from flock_follower.parameters.spec import specs_of
+from flock_follower.planner.parameter_table import planner_params
+from flock_follower.planner.params import PlannerParams
+from flock_follower.ranges import A_MAX, V_MAX
 
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULTS = {spec.name: spec.default for spec in (*specs_of(PlannerParams()),

@@ -52,7 +52,8 @@ from flock_follower.geometry import quaternion_to_matrix, rotation_vector_to_mat
 from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.messages import from_odometry, Make, NANOSECONDS, odometry
-from flock_follower.neighbors_file import parse
+from flock_follower.messages.poses import from_pose, pose_with_covariance, PoseState
+from flock_follower.parameters.neighbors_file import parse
 from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.perception.observed_wait import MAX_WAIT
 from flock_follower.perception.pending_images import Perceiver
@@ -60,7 +61,6 @@ from flock_follower.perception.tracker import Tracker
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import Member
-from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseState
 from flock_follower.ranges import parameter, Range
 
 LEADER = 'leader'

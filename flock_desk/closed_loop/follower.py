@@ -39,7 +39,6 @@ from flock_desk.follower import ControlCycle, Follower, Listener, Tick
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import ENGAGE_TIME, Operation, Scenario, VioErrors
 from flock_desk.sensors.sensing import DIRECTIONS
-from flock_follower.acceleration_messages import AccelerationState, with_acceleration
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
 from flock_follower.gate.envelope import GateLimits
@@ -55,6 +54,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.mavlink.dialects import PX4
 from flock_follower.messages import OdometryState, RELATIVE, to_nanoseconds
+from flock_follower.messages.accelerations import AccelerationState, with_acceleration
 from flock_follower.perception.neighbor_motion import POSITION, VELOCITY
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop

@@ -46,7 +46,6 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
-from flock_follower.command_messages import TRAJECTORY
 from flock_follower.files import resource
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
@@ -61,18 +60,9 @@ from flock_follower.messages import (
     read_stamp,
     STATE,
 )
-from flock_follower.neighbors_file import load, NeighborConfig
-from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
-from flock_follower.parameters.cameras import cameras, CameraValues
-from flock_follower.parameters.spec import filled
-from flock_follower.perception.parameter_table import tracker
-from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
-from flock_follower.perception.tracker import camera_mounting
-from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.modes import State
-from flock_follower.planner.parameter_table import planner_params
-from flock_follower.pose_messages import from_pose, from_range, POSE_TYPES, stamp_of
-from flock_follower.topic_names import (
+from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages.poses import from_pose, from_range, POSE_TYPES, stamp_of
+from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
     images_by_type,
@@ -81,6 +71,16 @@ from flock_follower.topic_names import (
     RAW_IMAGES,
     TYPES,
 )
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
+from flock_follower.parameters.cameras import cameras, CameraValues
+from flock_follower.parameters.neighbors_file import load, NeighborConfig
+from flock_follower.parameters.spec import filled
+from flock_follower.perception.parameter_table import tracker
+from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
+from flock_follower.perception.tracker import camera_mounting
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import State
+from flock_follower.planner.parameter_table import planner_params
 
 STATES = tuple(state.value for state in State)
 #: The assumed status of the autopilot while the bag was recorded.

@@ -45,8 +45,8 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.odometry.buffer import interpolate, OdometrySample
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import Estimate
 

@@ -34,7 +34,6 @@ from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_desk.runs.processes import LateError
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.command_messages import from_trajectory
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import (
     from_odometry,
@@ -43,8 +42,9 @@ from flock_follower.messages import (
     RELATIVE,
     stamp_to_nanoseconds,
 )
-from flock_follower.neighbors_file import MarkedNeighbor
+from flock_follower.messages.commands import from_trajectory
 from flock_follower.odometry.reader import OdometrySource
+from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.planner.params import PlannerParams
 

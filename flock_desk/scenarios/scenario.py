@@ -29,9 +29,9 @@ import numpy as np
 from flock_desk.scenarios.flock import Flock, Part
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
+from flock_follower.parameters.settings import refuse
 from flock_follower.planner.params import COLUMN_V_MAX, PlannerParams
 from flock_follower.ranges import parameter, Range
-from flock_follower.settings import refuse
 
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.

@@ -35,8 +35,10 @@ from flock_follower.checks.pictures import camera_model
 from flock_follower.checks.pose_topics import Arrival, judge_poses
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds, to_nanoseconds
-from flock_follower.neighbors_file import NeighborConfig
+from flock_follower.messages.poses import from_pose
+from flock_follower.messages.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.parameters.sections import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
@@ -48,8 +50,6 @@ from flock_follower.perception.pose import locate, target
 from flock_follower.perception.prints import BORDER_WIDTHS, Fault, turned_print, wrong_border
 from flock_follower.perception.search import everywhere
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pose_messages import from_pose
-from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 
 N_PICTURES: Final = 25  # images that are searched for markers
 PICTURE_PERIOD: Final = 0.1  # s, least time between two of these images

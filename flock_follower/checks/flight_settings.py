@@ -22,7 +22,7 @@ import math
 from flock_follower.checks.findings import ERROR, Finding, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.pictures import camera_model
-from flock_follower.settings import Camera, find_unsafe_settings
+from flock_follower.parameters.settings import Camera, find_unsafe_settings
 
 #: Messages after which a rate counts as measured.
 MEASURED_MESSAGES = 10

@@ -36,11 +36,11 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
 )
 from flock_follower.messages import OdometryState
+from flock_follower.messages.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.prints import Fault
 from flock_follower.ranges import MAX_GAP
-from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 
 
 class TopicEnd(NamedTuple):

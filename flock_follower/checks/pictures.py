@@ -23,8 +23,8 @@ import numpy as np
 
 from flock_follower.checks.findings import ERROR, Finding, first, OK, WARNING
 from flock_follower.checks.observations import Observations, Picture
+from flock_follower.parameters.settings import MARKER_LOST_WIDTH
 from flock_follower.perception.camera import CameraModel, marked_rectified
-from flock_follower.settings import MARKER_LOST_WIDTH
 
 #: Side of a marker, px, below which its range is noisy.
 NOISY_MARKER_WIDTH = 18.0

@@ -28,16 +28,16 @@ from flock_follower.checks.pose_path import judge_path, MIN_OUTLIER, WholeOdomet
 from flock_follower.checks.streams import BUSY, check_latency, check_rate
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
-from flock_follower.neighbors_file import NeighborConfig
+from flock_follower.messages.poses import POSE_TYPES, PoseState
+from flock_follower.messages.topic_names import full_name
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.odometry.static_frames import StaticFrames
+from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import LATE_POSE, MANY_OUTLIERS, Sourced
 from flock_follower.perception.tracker import Tracker
-from flock_follower.pose_messages import POSE_TYPES, PoseState
 from flock_follower.ranges import PREDICT_TIMEOUT
-from flock_follower.topic_names import full_name
 
 MOST_REFUSED: Final = 0.5  # share of refused poses from which on there is an error
 MAX_LATENCY: Final = 0.4  # s: a larger median is an error

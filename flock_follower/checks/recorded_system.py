@@ -33,12 +33,8 @@ from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.topics import check_nodes, check_topics
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
-from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
-from flock_follower.parameters.spec import filled
-from flock_follower.perception.markers import load
-from flock_follower.pose_messages import POSE_TYPES
-from flock_follower.ranges import MAX_GAP
-from flock_follower.topic_names import (
+from flock_follower.messages.poses import POSE_TYPES
+from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
     images_by_type,
@@ -47,6 +43,10 @@ from flock_follower.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
+from flock_follower.parameters.spec import filled
+from flock_follower.perception.markers import load
+from flock_follower.ranges import MAX_GAP
 
 #: s: of a longer bag only the beginning is checked.
 MAX_DURATION: Final = 300.0

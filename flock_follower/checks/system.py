@@ -19,19 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from flock_follower.bridge_state import (
-    ARMED,
-    LINK_FAULT,
-    MISSING,
-    NO_ANSWERS,
-    NOT_READY,
-    PARAMETER,
-    read_flag,
-    REFUSED,
-    UNANSWERED,
-    UNPROVEN,
-    UNREAD,
-)
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -44,7 +31,20 @@ from flock_follower.checks.findings import (
 from flock_follower.checks.observations import Machine, Observations
 from flock_follower.checks.processor import BUSY_SHARE
 from flock_follower.fast_dds import PROFILE_VARIABLES, UNDELIVERED
-from flock_follower.topic_names import full_name, OURS
+from flock_follower.messages.bridge_state import (
+    ARMED,
+    LINK_FAULT,
+    MISSING,
+    NO_ANSWERS,
+    NOT_READY,
+    PARAMETER,
+    read_flag,
+    REFUSED,
+    UNANSWERED,
+    UNPROVEN,
+    UNREAD,
+)
+from flock_follower.messages.topic_names import full_name, OURS
 
 STARVED_SHARE = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.

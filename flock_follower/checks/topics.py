@@ -31,9 +31,16 @@ from flock_follower.checks.observations import Observations
 from flock_follower.checks.pose_topics import check_poses
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.streams import check_stream
+from flock_follower.messages.topic_names import (
+    COMPRESSED_IMAGES,
+    full_name,
+    offer,
+    OURS,
+    RAW_IMAGES,
+    TYPES,
+)
 from flock_follower.parameters.sections import listed_files
 from flock_follower.ranges import MAX_GAP
-from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS, RAW_IMAGES, TYPES
 
 #: Only one node may publish these.
 ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',

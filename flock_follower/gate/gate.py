@@ -29,7 +29,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.command_messages import Command, ODOMETRY_GAP
 from flock_follower.gate import disturbance, envelope, setpoint_rules
 from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
 from flock_follower.gate.envelope import GateLimits, Location
@@ -50,6 +49,7 @@ from flock_follower.gate.velocity_check import (
 )
 from flock_follower.geometry import Array
 from flock_follower.messages import OdometryState
+from flock_follower.messages.commands import Command, ODOMETRY_GAP
 from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
 
 #: A command may rest on an image of at most this age, s; planners coast before.

@@ -38,8 +38,8 @@ import enum
 import math
 from typing import Final, NamedTuple
 
-from flock_follower import bridge_state
 from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.messages import bridge_state
 
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground'

@@ -37,7 +37,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.command_messages import Command, OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.gate import envelope
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.level_limit import limit_level
@@ -54,6 +53,7 @@ from flock_follower.gate.velocity_check import (
 )
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.messages import SANE
+from flock_follower.messages.commands import Command, OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.planner.limits import (
     brake,
     INSIDE_SHARE,

@@ -32,11 +32,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.obstacle import Refusal
 from flock_follower.gate.relative_flight import Relative
 from flock_follower.gate.velocity_check import KnownMotion
+from flock_follower.messages.commands import Command
 
 
 class AcceptedCommand(NamedTuple):

@@ -28,7 +28,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.bridge_state import LOST, NO_AUTOPILOT
 from flock_follower.gate.flight_end import EndParams, FlightEnd, Handover, HOLD
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Cause, Phase, STICK, Taker, UNKNOWN
@@ -51,6 +50,7 @@ from flock_follower.mavlink.sticks import KINDS, STICK_GAP, StickWatch
 from flock_follower.mavlink.takeover import EVIDENCE_AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.messages import OdometryState, to_nanoseconds
+from flock_follower.messages.bridge_state import LOST, NO_AUTOPILOT
 from flock_follower.ranges import first_reason
 
 #: At the end of the bridge braking ends below this speed, m/s.

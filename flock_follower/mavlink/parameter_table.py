@@ -29,9 +29,9 @@ from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.link import ID_RANGE
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.odometry.reader import SourceParams
+from flock_follower.parameters.settings import refuse
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.ranges import Range
-from flock_follower.settings import refuse
 
 ORIGIN_RANGES = {
     'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),

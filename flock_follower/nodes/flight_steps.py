@@ -28,7 +28,8 @@ from ipaddress import ip_address
 import math
 from typing import Final
 
-from flock_follower.bridge_state import (
+from flock_follower.mavlink.connection import parse_connection
+from flock_follower.messages.bridge_state import (
     ACTIVE,
     ARMED,
     BridgeState,
@@ -38,7 +39,6 @@ from flock_follower.bridge_state import (
     read_flag,
     READY,
 )
-from flock_follower.mavlink.connection import parse_connection
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.

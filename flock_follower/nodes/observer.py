@@ -44,19 +44,8 @@ from flock_follower.checks.reach import find_reach, Reach
 from flock_follower.checks.single_camera import select_camera
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
-from flock_follower.neighbors_file import NeighborConfig
-from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.diagnostics import STEADY
-from flock_follower.nodes.support.inputs import best_effort, StaticTransforms
-from flock_follower.nodes.support.process import run
-from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import READERS
-from flock_follower.nodes.support.shared_memory import shared_memory_size
-from flock_follower.odometry.reader import read_odometry
-from flock_follower.parameters.spec import CAMERAS
-from flock_follower.perception.markers import load
-from flock_follower.pose_messages import POSE_TYPES
-from flock_follower.topic_names import (
+from flock_follower.messages.poses import POSE_TYPES
+from flock_follower.messages.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
     full_name,
@@ -68,6 +57,17 @@ from flock_follower.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.diagnostics import STEADY
+from flock_follower.nodes.support.inputs import best_effort, StaticTransforms
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.runtime import READERS
+from flock_follower.nodes.support.shared_memory import shared_memory_size
+from flock_follower.odometry.reader import read_odometry
+from flock_follower.parameters.neighbors_file import NeighborConfig
+from flock_follower.parameters.spec import CAMERAS
+from flock_follower.perception.markers import load
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics

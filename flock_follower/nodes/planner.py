@@ -46,16 +46,16 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.acceleration_messages import from_acceleration
-from flock_follower.bridge_state import ARMED_AT_TOPIC, BridgeState
-from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
-from flock_follower.command_messages import trajectory
 from flock_follower.messages import (
     from_odometry,
     MOTION_TOPIC,
     OdometryState,
     stamp_to_nanoseconds,
 )
+from flock_follower.messages.accelerations import from_acceleration
+from flock_follower.messages.bridge_state import ARMED_AT_TOPIC, BridgeState
+from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
+from flock_follower.messages.commands import trajectory
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.even_clock import EvenClock
@@ -66,13 +66,13 @@ from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.support.sole_publisher import SolePublisher
 from flock_follower.parameters.cameras import cameras
+from flock_follower.parameters.settings import find_unsafe_settings
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.parameter_table import PLANNER as SPECS
 from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
-from flock_follower.settings import find_unsafe_settings
 
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node reports it
 FLOWN_TIME = 60.0  # s after the last flying tick in which a change of the bridge is reported

@@ -52,6 +52,13 @@ from flock_follower.messages import (
     OdometryState,
     read_stamp,
 )
+from flock_follower.messages.poses import (
+    child_frame,
+    from_range,
+    pose_topic,
+    TRANSFORMS,
+    transforms,
+)
 from flock_follower.nodes.support.conversions import make, message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
@@ -70,13 +77,6 @@ from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
-from flock_follower.pose_messages import (
-    child_frame,
-    from_range,
-    pose_topic,
-    TRANSFORMS,
-    transforms,
-)
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at if no odometry comes

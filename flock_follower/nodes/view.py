@@ -41,8 +41,6 @@ from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, Ra
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
-from flock_follower.command_messages import from_trajectory
 from flock_follower.geometry import Transform
 from flock_follower.messages import (
     from_odometry,
@@ -51,6 +49,15 @@ from flock_follower.messages import (
     ODOMETRY,
     OdometryState,
     stamp_to_nanoseconds,
+)
+from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
+from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.topic_names import (
+    COMPRESSED,
+    COMPRESSED_IMAGES,
+    IMAGE,
+    INFO,
+    RAW_IMAGES,
 )
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.image_middleware import (
@@ -70,7 +77,6 @@ from flock_follower.parameters.spec import CAMERAS, filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import compute_in_one_thread, decode_image
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.topic_names import COMPRESSED, COMPRESSED_IMAGES, IMAGE, INFO, RAW_IMAGES
 from flock_follower.view.access import Access, is_loopback, TOKEN_BYTES
 from flock_follower.view.flight import NodeReport, pose, ShownBattery, ShownFlight
 from flock_follower.view.parameter_table import VIEW

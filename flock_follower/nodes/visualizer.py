@@ -35,7 +35,6 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
-from flock_follower.command_messages import Command, from_trajectory
 from flock_follower.messages import (
     from_odometry,
     NANOSECONDS,
@@ -43,6 +42,7 @@ from flock_follower.messages import (
     set_quaternion,
     set_vector,
 )
+from flock_follower.messages.commands import Command, from_trajectory
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.process import run

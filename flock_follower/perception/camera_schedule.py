@@ -33,7 +33,7 @@ import numpy as np
 
 from flock_follower.geometry import Transform
 from flock_follower.messages import MAX_JUMP
-from flock_follower.neighbors_file import MarkedNeighbor
+from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.perception.search import N_PORTIONS

@@ -32,8 +32,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage

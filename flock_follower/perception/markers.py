@@ -30,9 +30,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower import neighbors_file
 from flock_follower.geometry import Array
-from flock_follower.neighbors_file import NeighborConfig
+from flock_follower.parameters import neighbors_file
+from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception.images import GrayImage
 
 # Any: neither version's type stubs know the other's names.
@@ -186,7 +186,7 @@ def load(path: str | Path) -> NeighborConfig:
     """
     Read a neighbors file; its dictionary must be in the installed OpenCV.
 
-    :raises ValueError, OSError: see :func:`flock_follower.neighbors_file.load`.
+    :raises ValueError, OSError: see :func:`flock_follower.parameters.neighbors_file.load`.
     """
     return neighbors_file.load(path, dictionary_size)
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
-from flock_follower.neighbors_file import NeighborConfig
+from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import draw_line, GrayImage
 from flock_follower.perception.markers import marker_corners

@@ -27,8 +27,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_follower.acceleration_messages import acceleration
 from flock_follower.messages import DUPLICATE, Make, odometry, OdometryState
+from flock_follower.messages.accelerations import acceleration
+from flock_follower.messages.poses import pose_topic, pose_with_covariance, PoseState, RangeState
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.perception.camera import CameraModel
@@ -38,7 +39,6 @@ from flock_follower.perception.observed_wait import N_OBSERVED, ObservedWait
 from flock_follower.perception.pose_sources import PoseSources
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
-from flock_follower.pose_messages import pose_topic, pose_with_covariance, PoseState, RangeState
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
 #: Odometry is late after this factor times the longest observed wait, plus a margin.

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import MarkedNeighbor
+from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import (
     EdgeFit,

@@ -33,14 +33,14 @@ import numpy as np
 
 from flock_follower.geometry import Array, normalize_quaternion, Transform
 from flock_follower.messages import FARTHEST, SANE
-from flock_follower.neighbors_file import PoseSource
+from flock_follower.messages.poses import PoseState
 from flock_follower.odometry.buffer import Missing
 from flock_follower.odometry.static_frames import BASE, StaticFrames
+from flock_follower.parameters.neighbors_file import PoseSource
 from flock_follower.perception.look import Sighting
 from flock_follower.perception.observed_wait import ObservedWait
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Tracker
-from flock_follower.pose_messages import PoseState
 
 #: A pose stamped up to this far ahead of the newest odometry, s, waits for it; beyond, clocks
 #: differ.

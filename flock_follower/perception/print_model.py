@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.images import gray_levels, GrayImage
 from flock_follower.perception.markers import (
     correctable_cells,

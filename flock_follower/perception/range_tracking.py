@@ -39,12 +39,12 @@ import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import FARTHEST
-from flock_follower.neighbors_file import MarkedNeighbor
+from flock_follower.messages.poses import RangeState
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
+from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION
 from flock_follower.perception.range_gate import RangeBias
-from flock_follower.pose_messages import RangeState
 from flock_follower.ranges import Checked, parameter, Range
 
 #: If a neighbor is unseen for this long, s, its state is estimated from its ranges ...

@@ -40,7 +40,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (

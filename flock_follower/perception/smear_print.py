@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.neighbors_file import Marker
+from flock_follower.parameters.neighbors_file import Marker
 from flock_follower.perception.markers import marker_code
 from flock_follower.perception.print_model import cell_code
 

@@ -43,8 +43,8 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import duplicate_name
-from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
+from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception import prints, search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import CameraSchedule, Sought

@@ -22,11 +22,17 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from flock_follower.acceleration_messages import AccelerationState, with_acceleration
-from flock_follower.bridge_state import ACTIVE, BridgeState, effective_state, parse, TAKEN_OVER
-from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.messages import FUTURE_TOLERANCE, OdometryState, RELATIVE
+from flock_follower.messages.accelerations import AccelerationState, with_acceleration
+from flock_follower.messages.bridge_state import (
+    ACTIVE,
+    BridgeState,
+    effective_state,
+    parse,
+    TAKEN_OVER,
+)
+from flock_follower.messages.commands import Command
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate
 from flock_follower.planner.memory import Memory

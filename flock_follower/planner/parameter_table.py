@@ -21,12 +21,12 @@ from functools import lru_cache
 import math
 from typing import Any
 
-from flock_follower.neighbors_file import load
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.cameras import ANGLES, CAMERA_SPECS, cameras, DEFAULT_RPY
+from flock_follower.parameters.neighbors_file import load
+from flock_follower.parameters.settings import refuse
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.planner.params import Member, PlannerParams
-from flock_follower.settings import refuse
 
 PLANNER = [
     Spec('require_bridge', True,

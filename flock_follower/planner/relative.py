@@ -34,8 +34,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.command_messages import OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.geometry import Array, SHORTEST
+from flock_follower.messages.commands import OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.planner.inputs import (
     find_newest,
     Neighbor,

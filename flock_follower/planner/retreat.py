@@ -28,8 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import Array, SHORTEST
+from flock_follower.messages.commands import ODOMETRY_GAP
 from flock_follower.planner.inputs import ACCELERATION_NOISE, Neighbor
 from flock_follower.planner.memory import Loss, max_age, Memory
 from flock_follower.planner.params import PlannerParams

@@ -28,10 +28,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.bridge_state import BridgeState, effective_state, parse, SILENCE_MAX
-from flock_follower.command_messages import Command
 from flock_follower.geometry import quaternion_to_matrix, Transform
 from flock_follower.messages import OdometryState
+from flock_follower.messages.bridge_state import BridgeState, effective_state, parse, SILENCE_MAX
+from flock_follower.messages.commands import Command
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.view.scene import (
     band,

@@ -29,9 +29,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, matrix_to_quaternion
 from flock_follower.messages import OdometryState, SANE
+from flock_follower.messages.commands import Command
 from flock_follower.planner.bound_keeping import COHESION, REASONS, SEPARATION
 
 #: Kinds of shapes.

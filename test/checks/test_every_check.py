@@ -45,10 +45,10 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.messages.topic_names import OURS, TYPES
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.prints import Fault as PrintFault
 from flock_follower.perception.prints import WRONG_BORDER
-from flock_follower.topic_names import OURS, TYPES
 
 LIVE, BAG, BOTH = (True,), (False,), (True, False)
 CAMERA = '/camera/camera/infra1/image_rect_raw'

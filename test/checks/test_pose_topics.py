@@ -29,11 +29,11 @@ from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
 from flock_follower.checks.pose_topics import check_poses
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
 from flock_follower.messages import odometry, to_nanoseconds
-from flock_follower.neighbors_file import parse
+from flock_follower.messages.poses import POSE, pose_with_covariance
+from flock_follower.messages.topic_names import names_there
+from flock_follower.parameters.neighbors_file import parse
 from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME, UNPLACED
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pose_messages import POSE, pose_with_covariance
-from flock_follower.topic_names import names_there
 
 START = 1_700_000_000.0  # s
 MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])

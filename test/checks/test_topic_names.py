@@ -19,7 +19,7 @@ from __future__ import annotations
 import pytest
 
 from flock_follower.messages import ODOMETRY
-from flock_follower.topic_names import (
+from flock_follower.messages.topic_names import (
     COMPRESSED,
     full_name,
     IMAGE,

@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 from situations import judge_situation
 
-from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import (
     approach_speed,
     find_exceeded_bound,
@@ -38,6 +37,7 @@ from flock_follower.gate.permission import Permission
 from flock_follower.gate.setpoint_rules import BRAKE, COMMAND
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import MotionReport
+from flock_follower.messages.commands import Command
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', True)
 STEP, CYCLE = 0.01, 5  # 20 Hz

@@ -19,11 +19,11 @@ import math
 import numpy as np
 import pytest
 
-from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import MotionReport
+from flock_follower.messages.commands import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()

@@ -24,7 +24,6 @@ import numpy as np
 import pytest
 from situations import judge_situation
 
-from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import approach_speed, GateLimits, Location
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.relative_flight import LONGEST_STEP, Reckoning, Relative
@@ -33,6 +32,7 @@ from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import known_motion, MotionReport, ODOM, SourceMotion
 from flock_follower.geometry import quaternion_from_rpy
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
+from flock_follower.messages.commands import Command
 
 LIMITS = GateLimits(relative_flight=True)
 LOST = SourceMotion((0.3, 0.0, 0.0), 9.0), SourceMotion(), ODOM

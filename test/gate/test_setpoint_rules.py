@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 from situations import judge_situation
 
-from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.permission import MODE_TIMEOUT
 from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, LEVEL, NONE
@@ -37,6 +36,7 @@ from flock_follower.gate.velocity_check import (
 )
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.messages import FASTEST_OWN
+from flock_follower.messages.commands import Command
 from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX, V_MAX
 
 LIMITS = GateLimits()

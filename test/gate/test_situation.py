@@ -22,7 +22,6 @@ import numpy as np
 from recorded_situation import read_situation
 from situations import situation
 
-from flock_follower.command_messages import Command, OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.obstacle import Obstacle
 from flock_follower.gate.permission import MODE_TIMEOUT
@@ -36,6 +35,7 @@ from flock_follower.gate.velocity_check import (
     ODOM,
     SourceMotion,
 )
+from flock_follower.messages.commands import Command, OLDEST_MARKER, RELATIVE_ACCELERATION_MAX
 
 ANY = st.floats() | st.floats(-4.0, 4.0)
 VECTOR = st.tuples(ANY, ANY, ANY)

@@ -35,8 +35,6 @@ import pytest
 from recorded_situation import read_situation
 from std_srvs.srv import SetBool, Trigger
 
-from flock_follower.bridge_state import REFUSED
-from flock_follower.command_messages import Command, trajectory
 from flock_follower.gate.setpoint_rules import COMMAND
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
@@ -44,6 +42,8 @@ from flock_follower.mavlink.commands import Outcome
 from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.messages import to_array
+from flock_follower.messages.bridge_state import REFUSED
+from flock_follower.messages.commands import Command, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.sole_publisher import SEVERAL

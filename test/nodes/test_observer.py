@@ -31,8 +31,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from flock_follower.checks.collector import POSES
+from flock_follower.messages.topic_names import OURS
 from flock_follower.nodes.observer import DISCOVERY, find_processes, Observer, SIMULATOR
-from flock_follower.topic_names import OURS
 
 
 def test_no_arrival_is_counted_before_the_clock_is_known(ros: None, monkeypatch: Any) -> None:

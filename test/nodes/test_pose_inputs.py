@@ -30,6 +30,7 @@ from sensor_msgs.msg import CameraInfo
 from test_relative_pose_node import AHEAD, calibration, LEADER, Rig, VELOCITY
 
 from flock_follower.messages import from_odometry
+from flock_follower.messages.poses import pose_with_covariance
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.pose_inputs import INVALID_FRAME
@@ -43,7 +44,6 @@ from flock_follower.perception.pose_sources import (
     UNTIMELY,
 )
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pose_messages import pose_with_covariance
 
 IN_CAMERA = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0]).inverse() @ AHEAD
 FILE = """

@@ -44,13 +44,13 @@ from flock_follower.messages import (
     set_vector,
     stamp_to_nanoseconds,
 )
+from flock_follower.messages.poses import from_pose
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pose_messages import from_pose
 
 CAMERA = make_camera()
 OWN = Transform.from_quaternion([1.0, 2.0, 3.0], quaternion_from_yaw(2.0))

@@ -21,7 +21,7 @@ from marker_images import DICTIONARY
 import numpy as np
 import pytest
 
-from flock_follower.neighbors_file import DICTIONARY_SIZES
+from flock_follower.parameters.neighbors_file import DICTIONARY_SIZES
 from flock_follower.perception import markers as aruco
 
 

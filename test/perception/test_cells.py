@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import Marker
+from flock_follower.parameters.neighbors_file import Marker
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.print_model import cell_code, CellCode, shows_code

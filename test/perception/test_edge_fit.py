@@ -40,7 +40,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception import edge_fit
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit

@@ -26,8 +26,8 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import quaternion_from_rpy, Transform
 from flock_follower.messages import from_odometry, odometry
+from flock_follower.messages.poses import from_pose, pose_with_covariance, transforms
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.pose_messages import from_pose, pose_with_covariance, transforms
 
 JUDGE = Path(__file__).resolve().parents[2] / 'benchmarks' / 'poses.py'
 IMAGES = 60

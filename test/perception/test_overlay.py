@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.overlay import (

@@ -43,7 +43,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception import pose as pose_module
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.images import GrayImage

@@ -26,13 +26,13 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_from_yaw, Transform
 from flock_follower.messages import from_odometry, odometry, to_nanoseconds
-from flock_follower.neighbors_file import NeighborConfig, parse, PoseSource
+from flock_follower.messages.poses import from_pose, pose_with_covariance, PoseState
+from flock_follower.parameters.neighbors_file import NeighborConfig, parse, PoseSource
 from flock_follower.perception import pose_sources
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
-from flock_follower.pose_messages import from_pose, pose_with_covariance, PoseState
 
 MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
 START = 1_700_000_000.0  # s

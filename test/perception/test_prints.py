@@ -27,7 +27,7 @@ import pytest
 from flock_follower.checks.collector import Collector, INVERTED, MIRRORED
 from flock_follower.checks.observations import Observations, Picture
 from flock_follower.geometry import rotation_vector_to_matrix, Transform
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception import prints
 from flock_follower.perception.look import Sighting
 from flock_follower.perception.markers import marker_code

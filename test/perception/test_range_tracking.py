@@ -24,12 +24,12 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import quaternion_from_yaw, Transform
-from flock_follower.neighbors_file import MarkedNeighbor
+from flock_follower.messages.poses import RangeState
 from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
+from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception import range_tracking
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, UNSEEN
-from flock_follower.pose_messages import RangeState
 
 NOISE = np.diag([0.002, 0.002, 0.002, 0.02, 0.02, 0.02]) ** 2
 TAG = np.array([0.0, 0.0, 0.1])

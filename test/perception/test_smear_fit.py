@@ -29,7 +29,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.neighbors_file import Marker
+from flock_follower.parameters.neighbors_file import Marker
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.smear_fit import descend, fit_smeared, SmearStart
 from flock_follower.perception.smear_print import smear_model

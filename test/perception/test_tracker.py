@@ -30,8 +30,8 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometrySample
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception import search
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.images import GrayImage

@@ -37,11 +37,11 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.command_messages import Command, from_trajectory, trajectory
 from flock_follower.flight_parameters import TABLE
 from flock_follower.gate.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.messages import from_odometry
+from flock_follower.messages.commands import Command, from_trajectory, trajectory
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose

@@ -24,7 +24,9 @@ import numpy as np
 import pytest
 
 from flock_follower.bags.message_types import empty
-from flock_follower.bridge_state import (
+from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
+from flock_follower.messages import from_odometry, odometry, OdometryState
+from flock_follower.messages.bridge_state import (
     ACTIVE,
     BRIDGE_STATES,
     BridgeState,
@@ -34,9 +36,7 @@ from flock_follower.bridge_state import (
     parse,
     SILENCE_MAX,
 )
-from flock_follower.command_messages import Command
-from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
-from flock_follower.messages import from_odometry, odometry, OdometryState
+from flock_follower.messages.commands import Command
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory, NONE
 from flock_follower.planner.modes import State

@@ -27,8 +27,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.command_messages import ODOMETRY_GAP
 from flock_follower.geometry import wrap_angle
+from flock_follower.messages.commands import ODOMETRY_GAP
 from flock_follower.planner.inputs import FRESH, Neighbor, predict
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State

@@ -26,8 +26,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.acceleration_messages import AccelerationState
 from flock_follower.messages import OdometryState
+from flock_follower.messages.accelerations import AccelerationState
 from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory

@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.command_messages import RELATIVE_ACCELERATION_MAX
 from flock_follower.messages import OdometryState, RELATIVE
+from flock_follower.messages.commands import RELATIVE_ACCELERATION_MAX
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory

@@ -18,7 +18,7 @@ import pytest
 
 from flock_desk.runs.directions import opposed
 from flock_follower.bags.message_types import empty
-from flock_follower.command_messages import Command, trajectory
+from flock_follower.messages.commands import Command, trajectory
 
 EAST = np.array([1.0, 0.0, 0.0])
 

@@ -38,8 +38,8 @@ from flock_follower.checks.recorded_system import check_bag
 from flock_follower.files import resource
 from flock_follower.flight_parameters import TABLE
 from flock_follower.messages import from_odometry, ODOMETRY
+from flock_follower.messages.topic_names import IMAGE, RANGE
 from flock_follower.parameters.files import read_parameters
-from flock_follower.topic_names import IMAGE, RANGE
 
 pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')

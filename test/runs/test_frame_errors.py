@@ -28,7 +28,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import OdometryState
-from flock_follower.neighbors_file import MarkedNeighbor, Marker
+from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.tracker import camera_mounting

@@ -32,10 +32,10 @@ from flock_follower.checks.recorded_system import check_bag
 from flock_follower.flight_parameters import TABLE
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.messages import from_odometry
+from flock_follower.messages.poses import POSE, pose_with_covariance
 from flock_follower.parameters.files import parse_parameters
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pose_messages import POSE, pose_with_covariance
 
 MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
 SECONDS = 8.0

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.command_messages import Command
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import OdometryState, RELATIVE
+from flock_follower.messages.commands import Command
 from flock_follower.view.flight import (
     clean,
     from_above,

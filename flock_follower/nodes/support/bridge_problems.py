@@ -25,7 +25,14 @@ from functools import partial
 import math
 import time
 
-from flock_follower.bridge_state import (
+from flock_follower.gate.motion_sources import onset
+from flock_follower.gate.permission import Cause, MODE_TIMEOUT, Phase
+from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
+from flock_follower.mavlink import estimator_health
+from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import TAKEOFF
+from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
+from flock_follower.messages.bridge_state import (
     ARMED,
     FLYING,
     LINK_FAULT,
@@ -38,13 +45,6 @@ from flock_follower.bridge_state import (
     UNPROVEN,
     UNREAD,
 )
-from flock_follower.gate.motion_sources import onset
-from flock_follower.gate.permission import Cause, MODE_TIMEOUT, Phase
-from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
-from flock_follower.mavlink import estimator_health
-from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.commands import TAKEOFF
-from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode

@@ -34,13 +34,13 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
-from flock_follower import bridge_state
 from flock_follower.gate.permission import Phase
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.parameter_check import ASK
 from flock_follower.mavlink.status_texts import WARNING
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
+    bridge_state,
     from_state,
     FUTURE_TOLERANCE,
     jump,

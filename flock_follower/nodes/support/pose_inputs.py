@@ -26,6 +26,7 @@ from typing import Any
 from rclpy.qos import QoSProfile
 
 from flock_follower.messages import stamp_age
+from flock_follower.messages.poses import from_pose, POSE_TYPES, stamp_of, TRANSFORMS
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import (
@@ -43,7 +44,6 @@ from flock_follower.perception.pose_sources import (
     Sourced,
     TWO_PUBLISHERS,
 )
-from flock_follower.pose_messages import from_pose, POSE_TYPES, stamp_of, TRANSFORMS
 
 INVALID_FRAME = 'invalid frame of another detector'
 LOOK_PERIOD = 0.5  # s between two looks at the publishers of the topics

@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from flock_follower.command_messages import TRAJECTORY
 from flock_follower.messages import ODOMETRY, STATE
+from flock_follower.messages.commands import TRAJECTORY
 
 #: The nodes that a flight needs.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
