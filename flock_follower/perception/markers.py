@@ -88,13 +88,24 @@ def marker_cells(name: str) -> int:
     return int(_dictionary(name).markerSize) + 2
 
 
+@lru_cache(maxsize=16)
 def correctable_cells(name: str) -> int:
     """
     Return how many cells may be misread so that a marker is still nearest to its own code.
 
+    Computed from the codes: before version 5, OpenCV has 0 for AprilTags, and 12 instead of 5 for
+    MIP_36h12.
+
     :raises ValueError: for an unknown dictionary.
     """
-    return int(_dictionary(name).maxCorrectionBits)
+    words = dictionary_words(name)
+    turned = np.concatenate([np.rot90(words, turn, axes=(1, 2)) for turn in range(4)])
+    colors, others = (np.where(each.reshape(len(each), -1), 1.0, -1.0).astype(np.float32)
+                      for each in (words, turned))
+    alike = colors @ others.T
+    np.fill_diagonal(alike, -np.inf)  # itself
+    differing = round(float(colors.shape[1] - alike.max()) / 2.0)
+    return max((differing - 1) // 2, 0)
 
 
 def draw_marker(dictionary: str, marker_id: int, side_px: int) -> GrayImage:
@@ -142,6 +153,7 @@ def detect(image: GrayImage, dictionary: str, border: int = 1) -> Detections:
     :raises ValueError: for an unknown dictionary.
     """
     book, cv_params = _dictionary(dictionary), _cv_params(border)
+    book.maxCorrectionBits = correctable_cells(dictionary)
     if _MODERN:
         found = _cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)
     else:

@@ -76,3 +76,12 @@ def test_detected_corners_have_no_bias_inwards(turn: float) -> None:
 def test_each_opencv_dictionary_is_known_by_size_without_opencv():
     for dictionary in aruco.dictionary_names():
         assert DICTIONARY_SIZES[dictionary] == aruco.dictionary_size(dictionary)
+
+
+@pytest.mark.parametrize(('name', 'cells'), [
+    ('DICT_4X4_50', 1), ('DICT_5X5_100', 3), ('DICT_6X6_250', 5), ('DICT_APRILTAG_16h5', 2),
+    ('DICT_APRILTAG_25h9', 4), ('DICT_APRILTAG_36h11', 5), ('DICT_ARUCO_ORIGINAL', 0),
+    *([('DICT_ARUCO_MIP_36h12', 5)] if hasattr(cv2.aruco, 'DICT_ARUCO_MIP_36h12') else [])])
+def test_correctable_cells_follow_from_codes_in_any_opencv(name: str, cells: int) -> None:
+    """OpenCV before 5 has 0 for AprilTags, and 12 for the last."""
+    assert aruco.correctable_cells(name) == cells

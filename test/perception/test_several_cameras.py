@@ -110,6 +110,7 @@ def test_neighbor_passes_between_images_without_gap_or_step(
         ahead(2.3, -0.5, up=0.4).translation, quaternion_from_yaw(-0.25))
     velocity, cameras = FLYING + np.array([0.0, 0.9, 0.0]), list[str]()
     off: list[Array] = []  # errors of place, m, and velocity, m/s, (6,), once settled
+    sigmas: list[Array] = []  # of both
     for k in range(60):
         for camera, stamp in (('front', 0.05 * k), ('left', 0.05 * k + later)):
             leader = Transform(start.rotation, start.translation + stamp * velocity)
@@ -120,13 +121,15 @@ def test_neighbor_passes_between_images_without_gap_or_step(
                 if stamp > 0.7:
                     off.append(np.concatenate([estimate.position - leader.translation,
                                                estimate.velocity - velocity]))
+                    sigmas.append(np.sqrt(estimate.covariance.diagonal()[:6]))
         assert sighting.estimates or cameras[-1] == 'front', f'not in sight at {0.05 * k:.2f} s'
     assert cameras[:5] == ['front'] * 5 and cameras[-5:] == ['left'] * 5
     assert sum(a != b for a, b in pairwise(cameras)) > 4, 'in the overlap both see it'
-    steps = np.abs(np.diff(off, axis=0)).max(axis=0)
+    steps = np.abs(np.diff(off, axis=0))
+    # Aslant by more than 60 degrees at last, 3 px per cell: OpenCV 4 and 5 measure it unlike.
+    assert np.all(steps < np.maximum([0.006] * 3 + [0.05] * 3, 2.0 * np.array(sigmas[1:])))
     assert np.abs(off).max(axis=0) == pytest.approx(0.0, abs=0.06)
     assert np.abs(off).max(axis=0)[:3].max() < 0.008
-    assert steps[:3].max() < 0.006 and steps[3:].max() < 0.05
 
 
 def watched(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int]:
