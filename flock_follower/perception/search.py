@@ -86,7 +86,7 @@ _LEVEL_STEP = 12
 #: Largest RMS, a share of the contrast, of a fit to a smeared print whose code was not read. Of
 #: right fits it is 0.01 to 0.03, of one to another print, in another pose, 0.07.
 _MAX_RMS = 0.04
-_STRAIGHT = 1.5  # px: smaller deviations from a side are no corners
+_MAX_DEVIATION = 1.5  # px from a side: less is no corner
 #: Least sine of the angle between a side that is whole and those beside.
 _MIN_SINE = 0.6
 #: Least and largest length of the visible sides beside, over that of the whole side.
@@ -97,7 +97,7 @@ _HIDDEN_SHARES = (0.0, 0.1, 0.18, 0.26)
 #: covered prints: that of id 17 of DICT_4X4_50, one white square with 8, resembles clutter.
 _MIN_COLOR_CHANGES = 12
 #: Correlation with a smeared or covered print from which on a quadrilateral may be a marker.
-_RESEMBLANCE = 0.85
+_MIN_RESEMBLANCE = 0.85
 #: Number of quadrilaterals, the likest ones, that are read cell by cell.
 _MOST_READ = 6
 #: From three sides, see _chains, to four corners.
@@ -214,6 +214,9 @@ def _find_similar(image: GrayImage, dictionary: str, markers: Sequence[Marker]) 
     No code is read: the fit of the pose must show it.
     """
     cells = marker_cells(dictionary)
+    sought = [marker for marker in markers if sum(
+        np.count_nonzero(np.diff(marker_code(dictionary, marker.marker_id), axis=axis))
+        for axis in (0, 1)) >= _MIN_COLOR_CHANGES]
     smooth = cv2.blur(image, (3, 3))
     contours = _contours(
         cv2.threshold(smooth, level, 255, cv2.THRESH_BINARY_INV)[1]
@@ -225,15 +228,13 @@ def _find_similar(image: GrayImage, dictionary: str, markers: Sequence[Marker]) 
             chains * [1.0, 1.0, *[1.0 / (1.0 - hidden)] * 2] @ _FROM_CHAIN), 0.5)
         visible = np.repeat(np.arange(-1, cells + 1) + 0.5 < (1.0 - hidden) * cells, cells + 2)
         seen = _unit(_sample_cells(image, outlines, cells)[:, visible])
-        for marker in markers:
-            code = marker_code(dictionary, marker.marker_id).astype(int)
-            if abs(np.diff(code)).sum() + abs(np.diff(code, axis=0)).sum() < _MIN_COLOR_CHANGES:
-                continue
+        for marker in sought:
             likeness = seen.dot(_unit(smear_model(marker, dictionary).by_cell[:, visible]).T)
             found += [(likeness[k].max(), likeness[k].argmax() >= 4 * N_SHARP, marker.marker_id,
                        np.roll(outlines[k], int(likeness[k].argmax()) % 4, axis=0))
                       for k in np.argsort(-likeness.max(axis=1, initial=0.0))[:1].tolist()]
-    found = sorted((each for each in found if each[0] > _RESEMBLANCE), key=lambda each: -each[0])
+    found = sorted((each for each in found if each[0] > _MIN_RESEMBLANCE),
+                   key=lambda each: -each[0])
     smeared = any(each[1] for each in found[:1])
     # A fit to a smeared print takes long.
     return _detections([each[2:] for each in found[:1 if smeared else 2]],
@@ -353,7 +354,7 @@ def _chains(contours: Iterable[Any]) -> Any:
     Complex numbers: two adjacent corners, clockwise, and from each along the next side as far as
     the longer one is visible.
     """
-    outlines = [cv2.approxPolyDP(contour, _STRAIGHT, True)[::-1, 0] @ (1.0, 1.0j)
+    outlines = [cv2.approxPolyDP(contour, _MAX_DEVIATION, True)[::-1, 0] @ (1.0, 1.0j)
                 for contour in contours]
     corners = np.concatenate([np.zeros((0, 4)), *(
         each[(np.arange(len(each))[:, None] + np.arange(4)) % len(each)] for each in outlines)])
