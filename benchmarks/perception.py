@@ -69,7 +69,6 @@ from flock_desk.sample_bag import (
 )
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.bags.writer import BagWriter
-from flock_follower.files import resource
 from flock_follower.geometry import Array, slerp, Transform
 from flock_follower.messages import (
     from_odometry,
@@ -86,6 +85,7 @@ from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 from flock_follower.planner.params import PlannerParams
+from flock_follower.system.files import resource
 
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
 SHORT = 100  # images of a flight that is rendered only to measure time

@@ -26,13 +26,13 @@ from pathlib import Path
 import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.files import resource
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds
 from flock_follower.messages.commands import from_trajectory
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.parameter_table import RELATIVE_POSE, tracker
 from flock_follower.perception.pending_images import Perceiver
+from flock_follower.system.files import resource
 
 GOLDEN = Path(__file__).resolve().parent / 'frozen' / 'sample.csv'
 BAG = resource('bags/sample')

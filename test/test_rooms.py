@@ -35,8 +35,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
-#: Modules beside the folders that every room may import.
-SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'signals', 'whole_file'}
+#: The modules beside the folders, and the folder, that every room may import.
+SHARED = {'geometry', 'ranges', 'signals', 'system'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),

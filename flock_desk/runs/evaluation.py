@@ -46,7 +46,6 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
-from flock_follower.files import resource
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
@@ -81,6 +80,7 @@ from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.parameter_table import planner_params
+from flock_follower.system.files import resource
 
 STATES = tuple(state.value for state in State)
 #: The assumed status of the autopilot while the bag was recorded.

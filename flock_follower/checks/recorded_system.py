@@ -31,7 +31,6 @@ from flock_follower.checks.pictures import check_pictures
 from flock_follower.checks.single_camera import select_camera
 from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.topics import check_nodes, check_topics
-from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
 from flock_follower.messages.poses import POSE_TYPES
 from flock_follower.messages.topic_names import (
@@ -47,6 +46,7 @@ from flock_follower.odometry.reader import OdometrySource, read_odometry, Source
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.markers import load
 from flock_follower.ranges import MAX_GAP
+from flock_follower.system.files import resource
 
 #: s: of a longer bag only the beginning is checked.
 MAX_DURATION: Final = 300.0

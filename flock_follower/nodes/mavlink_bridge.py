@@ -49,7 +49,6 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.fast_dds import opened_segment_names
 from flock_follower.gate.flight_end import CommandSources, EndParams
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase
@@ -75,6 +74,7 @@ from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import filled
+from flock_follower.system.fast_dds import opened_segment_names
 
 # Not only the newest: otherwise a second commanding node would not be detected.
 COMMANDS_QOS = best_effort(10)
