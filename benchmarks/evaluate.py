@@ -35,8 +35,8 @@ import time
 
 from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_follower.bags.bag import BagError, deserialize, open_bag
-from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.images import compute_in_one_thread, decode_image
 from flock_follower.system.files import resource
 

@@ -26,7 +26,7 @@ FLU        x forward, y left, z up                     bodies (``base_link``), R
 optical    x right, y down, z forward                  images, REP-103
 =========  ==========================================  ==============================
 
-The frames of MAVLink are in ``ned``.
+The frames of MAVLink are in ``mavlink.ned``.
 """
 
 from __future__ import annotations

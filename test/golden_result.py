@@ -49,8 +49,8 @@ def result() -> list[Row]:
     """
     # Here, because where only perception is installed the rest of the chain is not.
     from flock_desk.runs.evaluation import evaluate
-    from flock_follower.flight_parameters import TABLE
     from flock_follower.parameters.files import read_parameters
+    from flock_follower.parameters.flight_parameters import TABLE
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'result.mcap'

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower import geometry as geo
-from flock_follower import ned
+from flock_follower.mavlink import ned
 
 finite = st.floats(-1e3, 1e3)
 vectors = arrays(float, 3, elements=finite)

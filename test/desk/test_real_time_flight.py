@@ -50,7 +50,7 @@ from flock_follower.geometry import (
     Transform,
     yaw_from_quaternion,
 )
-from flock_follower.ned import enu_to_ned, yaw_enu_to_ned
+from flock_follower.mavlink.ned import enu_to_ned, yaw_enu_to_ned
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
 
