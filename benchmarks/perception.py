@@ -69,7 +69,8 @@ from flock_desk.sample_bag import (
 )
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.bags.writer import BagWriter
-from flock_follower.geometry import Array, slerp, Transform
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import slerp
 from flock_follower.messages import (
     from_odometry,
     NANOSECONDS,

@@ -48,8 +48,8 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
     R_FLU_OPTICAL,
-    rotation_vector_to_matrix,
 )
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.messages.topic_names import names_there, OURS, TYPES
 from flock_follower.parameters.files import read_parameters

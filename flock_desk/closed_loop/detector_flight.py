@@ -48,7 +48,8 @@ from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE
 from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
-from flock_follower.geometry import quaternion_to_matrix, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import quaternion_to_matrix, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.messages import from_odometry, Make, NANOSECONDS, odometry

@@ -22,13 +22,10 @@ from marker_images import known
 import numpy as np
 import pytest
 
-from flock_follower.geometry import (
-    Array,
+from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix, Transform
+from flock_follower.geometry.rotation_vectors import (
     matrix_to_rotation_vector,
-    quaternion_from_yaw,
-    quaternion_to_matrix,
     rotation_vector_to_matrix,
-    Transform,
 )
 from flock_follower.perception.innovation import ALIKE_TIME, to_body
 from flock_follower.perception.neighbor_filter import (
