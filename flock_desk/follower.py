@@ -52,13 +52,9 @@ from flock_follower.messages import (
     STATE,
     to_nanoseconds,
 )
-from flock_follower.messages.accelerations import (
-    ACCELERATION,
-    from_acceleration,
-    with_acceleration,
-)
+from flock_follower.messages.accelerations import from_acceleration, with_acceleration
 from flock_follower.messages.commands import Command, from_trajectory, TRAJECTORY, trajectory
-from flock_follower.messages.poses import POSE, PoseState, RangeState
+from flock_follower.messages.poses import ACCELERATION, POSE, PoseState, RangeState
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver
 from flock_follower.perception.pose_sources import Sourced

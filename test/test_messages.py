@@ -34,8 +34,9 @@ from flock_follower.messages import (
     SANE,
     stamp_age,
 )
-from flock_follower.messages.accelerations import acceleration, from_acceleration
+from flock_follower.messages.accelerations import from_acceleration
 from flock_follower.messages.commands import Command, from_trajectory, trajectory
+from flock_follower.messages.poses import acceleration
 from flock_follower.odometry.reader import OdometrySource
 
 

@@ -105,7 +105,7 @@ LOADED_ROOMS = {
 #: The messages that each of them loads, beside odometry, and whether the file of the neighbors:
 #: the markers by name and size alone.
 LOADED_PARTS = {
-    'relative_pose': 'accelerations neighbors_file poses',
+    'relative_pose': 'neighbors_file poses',
     'planner': 'accelerations bridge_state commands neighbors_file',
     'mavlink_bridge': 'bridge_state commands',
     'flock': '',
