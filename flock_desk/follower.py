@@ -53,7 +53,9 @@ from flock_follower.messages import (
     to_nanoseconds,
 )
 from flock_follower.messages.accelerations import from_acceleration, with_acceleration
-from flock_follower.messages.commands import Command, from_trajectory, TRAJECTORY, trajectory
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.command_writer import TRAJECTORY, trajectory
+from flock_follower.messages.commands import Command
 from flock_follower.messages.poses import ACCELERATION, POSE, PoseState, RangeState
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver

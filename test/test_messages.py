@@ -35,7 +35,9 @@ from flock_follower.messages import (
     stamp_age,
 )
 from flock_follower.messages.accelerations import from_acceleration
-from flock_follower.messages.commands import Command, from_trajectory, trajectory
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
 from flock_follower.messages.poses import acceleration
 from flock_follower.odometry.reader import OdometrySource
 

@@ -59,7 +59,7 @@ from flock_follower.messages import (
     read_stamp,
     STATE,
 )
-from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages.command_writer import TRAJECTORY
 from flock_follower.messages.poses import from_pose, from_range, POSE_TYPES, stamp_of
 from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,

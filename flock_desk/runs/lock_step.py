@@ -39,7 +39,7 @@ from flock_follower.messages import (
     ODOMETRY,
     OdometryState,
 )
-from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages.command_writer import TRAJECTORY
 
 OFFBOARD_TIME = 2.5  # s in offboard mode
 #: The leader leaves at once, faster than the default v_max: all commands point one way.

@@ -42,7 +42,7 @@ from flock_follower.messages import (
     RELATIVE,
     stamp_to_nanoseconds,
 )
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate

@@ -252,9 +252,3 @@ def from_state(make: Make, state: OdometryState) -> Any:
     return odometry(make, state.stamp, state.frame, state.child, state.position,
                     state.quaternion, to_child.dot(state.velocity), state.angular_velocity,
                     state.pose_covariance, twist)
-
-
-def twist(make: Make, linear: ArrayLike) -> Any:
-    message = make('geometry_msgs/msg/Twist')
-    set_vector(message.linear, linear)
-    return message

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from flock_follower.messages import ODOMETRY, STATE
-from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages.command_writer import TRAJECTORY
 
 #: The nodes that a flight needs.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')

@@ -63,7 +63,7 @@ from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.status_texts import DISTANCE_PERIOD
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import OdometryState, stamp_age
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import internal_error, STEADY
 from flock_follower.nodes.support.even_clock import EvenClock

@@ -55,7 +55,7 @@ from flock_follower.messages import (
 from flock_follower.messages.accelerations import from_acceleration
 from flock_follower.messages.bridge_state import ARMED_AT_TOPIC, BridgeState
 from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
-from flock_follower.messages.commands import trajectory
+from flock_follower.messages.command_writer import trajectory
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.even_clock import EvenClock

@@ -51,7 +51,7 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
 from flock_follower.messages.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,

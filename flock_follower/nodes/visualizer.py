@@ -42,7 +42,8 @@ from flock_follower.messages import (
     set_quaternion,
     set_vector,
 )
-from flock_follower.messages.commands import Command, from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.commands import Command
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.process import run
