@@ -106,8 +106,8 @@ LOADED_ROOMS = {
 #: the markers by name and size alone.
 LOADED_PARTS = {
     'relative_pose': 'neighbors_file poses',
-    'planner': 'accelerations bridge_state command_writer commands neighbors_file',
-    'mavlink_bridge': 'bridge_state command_reader commands',
+    'planner': 'accelerations bridge_reading bridge_state command_writer commands neighbors_file',
+    'mavlink_bridge': 'bridge_diagnostics bridge_state command_reader commands',
     'flock': '',
 }
 #: What the gate needs of the planner.

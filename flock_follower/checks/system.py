@@ -30,7 +30,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Machine, Observations
 from flock_follower.checks.processor import BUSY_SHARE
-from flock_follower.messages.bridge_state import (
+from flock_follower.messages.bridge_diagnostics import (
     ARMED,
     LINK_FAULT,
     MISSING,

@@ -53,7 +53,8 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.messages.accelerations import from_acceleration
-from flock_follower.messages.bridge_state import ARMED_AT_TOPIC, BridgeState
+from flock_follower.messages.bridge_reading import BridgeState
+from flock_follower.messages.bridge_state import ARMED_AT_TOPIC
 from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
 from flock_follower.messages.command_writer import trajectory
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
