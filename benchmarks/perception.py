@@ -71,12 +71,8 @@ from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.bags.writer import BagWriter
 from flock_follower.geometry import Array, Transform
 from flock_follower.geometry.rotation_vectors import slerp
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    OdometryState,
-    stamp_to_nanoseconds,
-)
+from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.odometry.buffer import OdometryBuffer
 from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception import markers as neighbors

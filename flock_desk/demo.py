@@ -50,7 +50,8 @@ from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.checks.processor import Load
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import from_odometry, OdometryState
+from flock_follower.messages import OdometryState
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.parameters.files import parameters_flown
 from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.planner.parameter_table import planner_params

@@ -43,10 +43,8 @@ from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport, ODOM
 from flock_follower.geometry import Array
 from flock_follower.messages import (
-    from_odometry,
     Make,
     NANOSECONDS,
-    ODOMETRY,
     OdometryState,
     stamp_age,
     STATE,
@@ -57,6 +55,8 @@ from flock_follower.messages.command_reader import from_trajectory
 from flock_follower.messages.command_writer import TRAJECTORY, trajectory
 from flock_follower.messages.commands import Command
 from flock_follower.messages.poses import ACCELERATION, POSE, PoseState, RangeState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver
 from flock_follower.perception.pose_sources import Sourced

@@ -26,8 +26,9 @@ from pathlib import Path
 import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.messages import from_odometry, stamp_to_nanoseconds
+from flock_follower.messages import stamp_to_nanoseconds
 from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.parameter_table import RELATIVE_POSE, tracker

@@ -102,13 +102,14 @@ LOADED_ROOMS = {
     'mavlink_bridge': f'gate mavlink ned planner {_ALL_LOAD}',
     'flock': f'flock {_ALL_LOAD}',
 }
-#: The messages that each of them loads, beside odometry, and whether the file of the neighbors:
-#: the markers by name and size alone.
+#: The messages that each of them loads, and whether the file of the neighbors: the markers by name
+#: and size alone.
 LOADED_PARTS = {
-    'relative_pose': 'neighbors_file poses',
-    'planner': 'accelerations bridge_reading bridge_state command_writer commands neighbors_file',
-    'mavlink_bridge': 'bridge_diagnostics bridge_state command_reader commands',
-    'flock': '',
+    'relative_pose': 'neighbors_file poses state_reader state_writer',
+    'planner': 'accelerations bridge_reading bridge_state command_writer commands neighbors_file '
+               'state_reader',
+    'mavlink_bridge': 'bridge_diagnostics bridge_state command_reader commands state_writer',
+    'flock': 'state_reader state_writer',
 }
 #: What the gate needs of the planner.
 LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',

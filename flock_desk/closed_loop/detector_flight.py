@@ -52,8 +52,10 @@ from flock_follower.geometry import quaternion_to_matrix, Transform
 from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
-from flock_follower.messages import from_odometry, Make, NANOSECONDS, odometry
+from flock_follower.messages import Make, NANOSECONDS
 from flock_follower.messages.poses import from_pose, pose_with_covariance, PoseState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 from flock_follower.parameters.neighbors_file import parse
 from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.perception.observed_wait import MAX_WAIT

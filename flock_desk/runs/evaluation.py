@@ -51,16 +51,11 @@ from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
 from flock_follower.geometry import Array
 from flock_follower.mavlink.parameter_table import gate_limits
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    ODOMETRY,
-    OdometryState,
-    read_stamp,
-    STATE,
-)
+from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, STATE
 from flock_follower.messages.command_writer import TRAJECTORY
 from flock_follower.messages.poses import from_pose, from_range, POSE_TYPES, stamp_of
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,
     full_name,

@@ -31,8 +31,9 @@ from flock_follower.checks.pictures import check_pictures
 from flock_follower.checks.single_camera import select_camera
 from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.topics import check_nodes, check_topics
-from flock_follower.messages import NANOSECONDS, ODOMETRY
+from flock_follower.messages import NANOSECONDS
 from flock_follower.messages.poses import POSE_TYPES
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,
     full_name,

@@ -15,9 +15,9 @@
 """
 Conversion of messages to numpy and back, and the first check of their values.
 
-NaN is refused by ``from_odometry`` here (neighbors), ``odometry.reader`` (odometry),
-``planner.inputs`` (every state), ``gate.setpoint_rules`` (everything that decides on a setpoint)
-and ``mavlink.setpoint_encoding`` (the wire).
+NaN is refused by ``state_reader`` (neighbors), ``odometry.reader`` (odometry), ``planner.inputs``
+(every state), ``gate.setpoint_rules`` (everything that decides on a setpoint) and
+``mavlink.setpoint_encoding`` (the wire).
 
 The functions work with any message classes: rclpy's in the nodes, the type store's when bags are
 read. To build a message, the caller passes ``make``, which returns an empty message of a type such
@@ -33,18 +33,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import (
-    Array,
-    canonical_quaternion,
-    normalize_quaternion,
-    quaternion_to_matrix,
-)
+from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
 NANOSECONDS = 1_000_000_000
 _NANOSEC = Range(0, NANOSECONDS - 1, whole=True)
 
-ODOMETRY = 'nav_msgs/msg/Odometry'
 STATE = 'std_msgs/msg/String'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
@@ -192,63 +186,3 @@ def jump(before: Moving, after: Moving, elapsed: float, tolerance: float) -> flo
         x + 0.5 * elapsed * (v + w) for x, v, w in zip(
             before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())])
     return distance if distance > tolerance else 0.0
-
-
-def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
-    """
-    Return the state of an Odometry message, its velocity in the header's frame.
-
-    ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
-    that put the linear velocity in the header's frame.
-
-    :raises ValueError: if position, attitude or velocity is not finite, or beyond ``SANE``, or
-        the stamp is invalid.
-    """
-    pose, twist = message.pose.pose, message.twist.twist
-    x = pose.orientation
-    stamp, q = read_stamp(message.header.stamp), normalize_quaternion([x.x, x.y, x.z, x.w])
-    position, linear, angular = map(to_array, (pose.position, twist.linear, twist.angular))
-    for name, value in (('position', position), ('linear velocity', linear),
-                        ('angular velocity', angular)):
-        if not all(abs(number) <= SANE for number in value.tolist()):  # written so that NaN fails
-            raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
-    rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
-    return OdometryState(
-        stamp, message.header.frame_id, message.child_frame_id, position, q, rotation.dot(linear),
-        angular, np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
-        np.asarray(message.twist.covariance, dtype=float).reshape(6, 6), rotation)
-
-
-def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike,
-             quaternion: ArrayLike, velocity_child: ArrayLike,
-             angular_velocity_child: ArrayLike = (0.0, 0.0, 0.0),
-             pose_covariance: Any = None, twist_covariance: Any = None) -> Any:
-    """
-    Return an Odometry message; the twist is given, and sent, in the child frame (REP-105).
-
-    ``stamp`` in ns. Covariances are (6, 6), in the order x, y, z, rotations about x, y, z. None
-    becomes zeros, which means unknown.
-    """
-    message = make(ODOMETRY)
-    set_stamp(message.header.stamp, stamp)
-    message.header.frame_id = frame
-    message.child_frame_id = child
-    set_vector(message.pose.pose.position, position)
-    set_quaternion(message.pose.pose.orientation, canonical_quaternion(quaternion))
-    set_vector(message.twist.twist.linear, velocity_child)
-    set_vector(message.twist.twist.angular, angular_velocity_child)
-    if pose_covariance is not None:
-        message.pose.covariance = np.asarray(pose_covariance, dtype=float).reshape(36)
-    if twist_covariance is not None:
-        message.twist.covariance = np.asarray(twist_covariance, dtype=float).reshape(36)
-    return message
-
-
-def from_state(make: Make, state: OdometryState) -> Any:
-    """Return the Odometry message of a state, its twist in the child frame (REP-105)."""
-    to_child = quaternion_to_matrix(state.quaternion).T
-    twist = state.twist_covariance.copy()
-    twist[:3, :3] = to_child.dot(state.velocity_covariance).dot(to_child.T)
-    return odometry(make, state.stamp, state.frame, state.child, state.position,
-                    state.quaternion, to_child.dot(state.velocity), state.angular_velocity,
-                    state.pose_covariance, twist)

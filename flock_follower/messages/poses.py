@@ -28,13 +28,13 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array, canonical_quaternion, Transform
 from flock_follower.messages import (
     Make,
-    ODOMETRY,
     read_stamp,
     set_quaternion,
     set_stamp,
     set_vector,
     to_array,
 )
+from flock_follower.messages.state_writer import ODOMETRY
 
 ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'

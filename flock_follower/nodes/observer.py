@@ -42,8 +42,9 @@ from flock_follower.checks.observations import Machine, Observations, TopicEnd, 
 from flock_follower.checks.processor import Load, LOAD_PERIOD, LoadMeter
 from flock_follower.checks.reach import find_reach, Reach
 from flock_follower.checks.single_camera import select_camera
-from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.messages.poses import POSE_TYPES
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,

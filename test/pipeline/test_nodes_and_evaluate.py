@@ -39,10 +39,10 @@ from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
 from flock_follower.gate.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
-from flock_follower.messages import from_odometry
 from flock_follower.messages.command_reader import from_trajectory
 from flock_follower.messages.command_writer import trajectory
 from flock_follower.messages.commands import Command
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose

@@ -31,8 +31,8 @@ from flock_follower.checks.findings import ERROR, OK, WARNING
 from flock_follower.checks.recorded_system import check_bag
 from flock_follower.geometry import Array, Transform
 from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
-from flock_follower.messages import from_odometry
 from flock_follower.messages.poses import POSE, pose_with_covariance
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.parameters.files import parse_parameters
 from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.neighbor_filter import UpdateOutcome

@@ -41,7 +41,6 @@ from flock_follower.mavlink.status_texts import WARNING
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     bridge_state,
-    from_state,
     FUTURE_TOLERANCE,
     jump,
     MOTION_TOPIC,
@@ -51,6 +50,7 @@ from flock_follower.messages import (
     set_vector,
     to_nanoseconds,
 )
+from flock_follower.messages.state_writer import from_state
 from flock_follower.nodes.support.bridge_problems import BridgeProblems
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import Problem
