@@ -46,9 +46,9 @@ from flock_follower.bags.parameter_table import recordings_folder
 from flock_follower.bags.recording import FlightRecording
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.messages.topic_names import COMPRESSED, full_name, IMAGE, INFO, OURS, TYPES
-from flock_follower.nodes import no_exit_deadline
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
+from flock_follower.nodes.support.exit_deadline import no_exit_deadline
 from flock_follower.nodes.support.image_middleware import (
     avoid_shared_memory_for_images,
     receive_buffer_max,
