@@ -106,10 +106,10 @@ LOADED_ROOMS = {
 #: and size alone.
 LOADED_PARTS = {
     'relative_pose': 'neighbors_file poses state_reader state_writer',
-    'planner': 'accelerations bridge_reading bridge_state command_writer commands neighbors_file '
-               'state_reader',
-    'mavlink_bridge': 'bridge_diagnostics bridge_state command_reader commands state_writer',
-    'flock': 'state_reader state_writer',
+    'planner': 'accelerations bridge_reading bridge_state command_writer commands jumps '
+               'neighbors_file state_reader',
+    'mavlink_bridge': 'bridge_diagnostics bridge_state command_reader commands jumps state_writer',
+    'flock': 'jumps state_reader state_writer',
 }
 #: What the gate needs of the planner.
 LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',

@@ -27,8 +27,7 @@ as 'nav_msgs/msg/Odometry'.
 from __future__ import annotations
 
 from collections.abc import Callable
-import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,11 +63,6 @@ POSITION_JUMP = 0.3
 FUTURE_TOLERANCE = 0.1
 #: s: a stamp farther back is a new start (a bag played again), not a message out of order.
 MAX_JUMP = 0.5
-#: m: odometry farther from its prediction has another frame than before: places in the old frame
-#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source. ``jump``
-#: is the rule. Two others predict otherwise: ``derivation`` has positions alone, and
-#: ``velocity_check.Path`` allows for motion in a gap.
-ODOMETRY_JUMP = 0.25
 #: m: a neighbor's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5
 #: Standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
@@ -161,28 +155,3 @@ class OdometryState(NamedTuple):
         turned: Array = self.twist_rotation.dot(self.twist_covariance[:3, :3]).dot(
             self.twist_rotation.T)
         return turned
-
-
-class Moving(Protocol):
-    """A state with a position (3,), m, and a velocity (3,), m/s."""
-
-    @property
-    def position(self) -> Array:
-        """Return the position."""
-
-    @property
-    def velocity(self) -> Array:
-        """Return the velocity."""
-
-
-def jump(before: Moving, after: Moving, elapsed: float, tolerance: float) -> float:
-    """
-    Return the distance, m, of a position from its prediction if it exceeds a tolerance, else 0.
-
-    The prediction is from ``elapsed`` s before, with the mean of both velocities: exact for a
-    constant acceleration.
-    """
-    distance = math.dist(after.position.tolist(), [
-        x + 0.5 * elapsed * (v + w) for x, v, w in zip(
-            before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())])
-    return distance if distance > tolerance else 0.0

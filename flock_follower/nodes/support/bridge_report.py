@@ -42,14 +42,13 @@ from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     bridge_state,
     FUTURE_TOLERANCE,
-    jump,
     MOTION_TOPIC,
     NANOSECONDS,
-    ODOMETRY_JUMP,
     OdometryState,
     set_vector,
     to_nanoseconds,
 )
+from flock_follower.messages.jumps import jump, ODOMETRY_JUMP
 from flock_follower.messages.state_writer import from_state
 from flock_follower.nodes.support.bridge_problems import BridgeProblems
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
