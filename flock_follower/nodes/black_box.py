@@ -60,7 +60,8 @@ from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, LONGEST_WAIT, Waiting
 from flock_follower.parameters.cameras import cameras
 from flock_follower.parameters.files import FLOWN
-from flock_follower.perception.images import decode_image, encode_jpeg
+from flock_follower.perception.encoding import encode_jpeg
+from flock_follower.perception.images import decode_image
 from flock_follower.system.files import resource
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
