@@ -39,7 +39,8 @@ from flock_desk.closed_loop.real_time_flight import (
     RenderedImage,
     STEP_NS,
 )
-from flock_desk.follower import ControlCycle, Follower, Listener, Tick
+from flock_desk.follower import Follower
+from flock_desk.follower.outcomes import ControlCycle, Listener, Tick
 from flock_desk.scenarios.scenario import Part, Scenario
 from flock_desk.sensors.sensing import facing, in_view, PerceptionNoise
 from flock_desk.sensors.vio import Due, Odometry

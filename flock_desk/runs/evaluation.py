@@ -35,7 +35,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_desk.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
+from flock_desk.follower import Follower
+from flock_desk.follower.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_desk.runs.decoding import decoded_ahead
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
