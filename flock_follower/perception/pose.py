@@ -151,8 +151,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         whole = _fit_whole(image, camera, sought, _smear_starts(
             image, camera, sought, expected.pose, True))
     if whole is not None and (found is None or blurred):
-        return _of_smears(image, camera, sought, whole, expected, last) if check_mirrored else (
-            _with_doubt(sought, whole, last))
+        return _of_smears(image, camera, sought, whole, expected, last, check_mirrored)
     return None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
 
@@ -286,7 +285,8 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
         if found is not None and found.rms < most_rms and (
                 most_rms == 1.0 or found.smear.dot(found.smear) < (
                     MAX_UNREAD_SMEAR * (sought.smears[index].cells - 2))**2):
-            return _of_smears(image, camera, sought, _Whole(index, found), expected, None, True)
+            return _of_smears(
+                image, camera, sought, _Whole(index, found), expected, None, True, True)
     return None
 
 
@@ -366,66 +366,51 @@ def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
 
 
 def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Whole,
-               expected: PosePrior, last: Measurement | None,
+               expected: PosePrior, last: Measurement | None, check_mirrored: bool,
                detected: bool = False) -> Measurement:
     """
-    Return the measurement of the likelier attitude: of a fit, or of its mirrored one.
+    Return the measurement of a smeared print, with the probability of the mirrored attitude.
+
+    If both attitudes are fitted, the likelier one is returned. The image says little about the
+    attitude, so the expected attitude is not used: it would confirm itself. If the mirrored
+    attitude is not fitted, it keeps the probability of the last image.
 
     :param last: the last measurement, if any: if its print was smeared, the mirrored attitude can
         wait for an image with steps left.
+    :param check_mirrored: whether to fit the mirrored attitude, too.
     :param detected: whether the marker was just detected: then a lone fit is in doubt.
     """
     index, fitted = found
-    start = _mirrored_body(sought, index, fitted.pose)
+    mirrored = _mirrored_body(sought, index, fitted.pose)
     can_wait = last is not None and last.smear is not None
     steps = MAX_STEPS - fitted.steps if can_wait else MOST_STEPS
-    other = None if start is None or steps < 1 else descend(
-        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens), True,
-        steps)
-    if start is not None and other is None and (can_wait or detected):
-        return _with_doubt(sought, found, last, detected)
-    # Little smear leaves edges: if they do not fit, something covers a part of the print.
-    covered = detected and fitted.blur < PLAIN_BLUR
-    return _choose_smeared(sought, index, [fitted] if other is None else [fitted, other], expected,
-                           UNRIVALED_DOUBT if covered else 0.0)
+    other = None if not check_mirrored or mirrored is None or steps < 1 else descend(
+        image, camera, sought.smears[index], SmearStart(mirrored, fitted.smear, fitted.lens),
+        True, steps)
+    if check_mirrored and (mirrored is None or other is not None or not (can_wait or detected)):
+        fits = [fitted] if other is None else [fitted, other]
+        least = min(each.rms for each in fits)
+        best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
+                       for each in fits], PosePrior(None, expected.up))
+        # Little smear leaves edges: if they do not fit, something covers a part of the print.
+        covered = detected and fitted.blur < PLAIN_BLUR
+        return mix_poses(_smear_measurement(sought, index, best.chosen.fit), best._replace(
+            share=max(best.share, UNRIVALED_DOUBT if covered else 0.0)))
+    measurement = _smear_measurement(sought, index, fitted)
+    if mirrored is None or (last is None and not detected):
+        return measurement
+    doubt = UNRIVALED_DOUBT if last is None else last.doubt
+    if last is not None and angle(mirrored, last.T_camera_body) < angle(
+            fitted.pose, last.T_camera_body):
+        doubt = 1.0 - doubt
+    return mix_poses(measurement, Choice(
+        Hypothesis(fitted.pose, 0.0), 0.0, Hypothesis(mirrored, 0.0), doubt))._replace(margin=None)
 
 
 def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | None:
     """Return the pose of a neighbor mirrored about the sight of a marker; None if the same."""
     on_body = sought.neighbor.markers[index].T_body_marker
     return mirror(pose, pose.apply(on_body.translation[None])[0], on_body.rotation[:, 2])
-
-
-def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
-                    expected: PosePrior, least_doubt: float) -> Measurement:
-    """
-    Return the measurement of the likelier of one or both attitudes of a smeared marker.
-
-    The image says little about the attitude, so the expected attitude is not used: it would
-    confirm itself.
-
-    :param least_doubt: least probability of the other attitude.
-    """
-    least = min(each.rms for each in fits)
-    best = choose([Hypothesis(each.pose, EFFECTIVE_SMEAR_SAMPLES * (each.rms / least)**2, each)
-                   for each in fits], PosePrior(None, expected.up))
-    return mix_poses(_smear_measurement(sought, index, best.chosen.fit),
-                     best._replace(share=max(best.share, least_doubt)))
-
-
-def _with_doubt(sought: Target, found: _Whole, last: Measurement | None,
-                detected: bool = False) -> Measurement:
-    """Return a smeared marker's measurement; the mirrored attitude keeps its last probability."""
-    pose = found.fit.pose
-    measurement = _smear_measurement(sought, found.number, found.fit)
-    other = _mirrored_body(sought, found.number, pose)
-    if other is None or (last is None and not detected):
-        return measurement
-    doubt = UNRIVALED_DOUBT if last is None else last.doubt
-    if last is not None and angle(other, last.T_camera_body) < angle(pose, last.T_camera_body):
-        doubt = 1.0 - doubt
-    return mix_poses(measurement, Choice(
-        Hypothesis(pose, 0.0), 0.0, Hypothesis(other, 0.0), doubt))._replace(margin=None)
 
 
 def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measurement:
