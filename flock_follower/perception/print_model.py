@@ -295,17 +295,15 @@ class EdgeModel:
     ``places`` (n + c, 3) are the points, then the middles of the markers' cells. ``tangents`` (n,
     3) are unit vectors with black on the left and white on the right, seen from the front.
     ``axis`` (n,) is 0 for edges across the marker's x axis, 1 across y. ``room`` (n, 2) is the
-    distance to the next edge on the black side and on the white side, m. ``marker`` (n,) and
-    ``cell_marker`` (c,) are the indices of the markers. For each marker: ``centers`` and
-    ``facings`` (m, 3), its middle and its normal, and ``codes``.
+    distance to the next edge on the black side and on the white side, m. ``marker`` (n,) is the
+    index of the marker. For each marker: ``centers`` and ``facings`` (m, 3), its middle and its
+    normal, and ``codes``.
     """
 
     def __init__(self, places: Array, tangents: Array, axis: Any, room: Array, marker: Any,
-                 cell_marker: Any, centers: Array, facings: Array,
-                 codes: tuple[CellCode, ...]) -> None:
+                 centers: Array, facings: Array, codes: tuple[CellCode, ...]) -> None:
         self.places, self.tangents, self.axis, self.room = places, tangents, axis, room
-        self.marker, self.cell_marker = marker, cell_marker
-        self.centers, self.facings, self.codes = centers, facings, codes
+        self.marker, self.centers, self.facings, self.codes = marker, centers, facings, codes
         # Which edges are across either axis, (2, n); how many, (2,); one of each axis.
         self.across = np.array([[0], [1]]) == axis
         self.counts = self.across.sum(axis=1).astype(float)
@@ -336,13 +334,14 @@ class EdgeModel:
             return self
         key = markers.tobytes()
         if key not in self._parts:
-            edges, cells = markers[self.marker], markers[self.cell_marker]
+            edges = markers[self.marker]
+            cells = np.repeat(markers, [len(code.centers) for code in self.codes])
             renumbered = np.cumsum(markers) - 1
             self._parts[key] = EdgeModel(
                 self.places[np.concatenate([edges, cells])], self.tangents[edges],
                 self.axis[edges], self.room[edges], renumbered[self.marker[edges]],
-                renumbered[self.cell_marker[cells]], self.centers[markers],
-                self.facings[markers], tuple(c for c, m in zip(self.codes, markers) if m))
+                self.centers[markers], self.facings[markers],
+                tuple(c for c, m in zip(self.codes, markers) if m))
         return self._parts[key]
 
 
@@ -363,7 +362,6 @@ def edge_model(neighbor: MarkedNeighbor, dictionary: str) -> EdgeModel:
     return EdgeModel(
         np.concatenate([*points, *(code.centers for code in codes)]), np.concatenate(tangents),
         np.concatenate(axis), np.concatenate(room), np.concatenate(index),
-        np.repeat(np.arange(len(codes)), [len(code.centers) for code in codes]),
         np.stack([m.T_body_marker.translation for m in neighbor.markers]),
         np.stack([m.T_body_marker.rotation[:, 2] for m in neighbor.markers]), codes)
 
