@@ -39,7 +39,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.innovation import to_body
 from flock_follower.perception.markers import marker_corners
-from flock_follower.perception.measurement import angle, Measurement, PosePrior
+from flock_follower.perception.measurement import angle, MAX_TURN, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import (
     ATTITUDE,
     Estimate,
@@ -47,7 +47,7 @@ from flock_follower.perception.neighbor_motion import (
     STATE_SIZE,
     VELOCITY,
 )
-from flock_follower.perception.pose import contradicts, locate, MAX_TURN, Target
+from flock_follower.perception.pose import contradicts, locate, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.square_pose import refine
 from flock_follower.perception.time_offset import MountedCamera

@@ -39,6 +39,8 @@ SIGMA_UPRIGHT = 0.25
 MAX_HISTORY = 9.0
 #: Two attitudes closer than this, rad, are one.
 SAME_ATTITUDE = 0.02
+#: An attitude that differs by more, rad, is another one.
+MAX_TURN = 0.3
 
 
 class PosePrior(NamedTuple):
@@ -147,3 +149,24 @@ def mix_poses(measurement: Measurement, best: Choice) -> Measurement:
         T_camera_body=apply_step(pose, at, best.share * apart),
         covariance=measurement.covariance
         + best.share * (1.0 - best.share) * np.outer(apart, apart))
+
+
+#: The mirrored attitude is fitted in every image while its chi^2 is within this of the other's.
+SETTLED_MARGIN = 100.0
+#: Images from one fit of the mirrored attitude to the next, otherwise.
+MIRRORED_EVERY = 30
+#: Images from one fit of the mirrored attitude of a smeared print to the next.
+SMEARED_EVERY = 3
+#: Probability of the mirrored attitude below which the other one is settled.
+SETTLED = 0.05
+
+
+def images_unchecked(found: Measurement, expected: PosePrior) -> int:
+    """Return the number of images until the mirrored attitude is checked again."""
+    assert found.margin is not None
+    if found.spacing is not None:
+        return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
+    # Both attitudes in one, with a margin of 0, may part soon.
+    settled = found.margin > 0.0 and found.doubt < SETTLED and expected.pose is not None and (
+        angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
+    return SMEARED_EVERY - 1 if settled else 0

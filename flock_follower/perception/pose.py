@@ -45,6 +45,7 @@ from flock_follower.perception.measurement import (
     choose,
     DEVIATION_FACTOR,
     Hypothesis,
+    MAX_TURN,
     Measurement,
     mix_poses,
     PosePrior,
@@ -86,8 +87,6 @@ PLAIN_INLIER_SHARE = 0.9
 RUN_TOGETHER = 0.25
 #: If a print that is followed smeared is blurred by more than this, cells, it has no edges to fit.
 EDGELESS = 0.3
-#: An attitude that differs by more, rad, is another one.
-MAX_TURN = 0.3
 #: Most steps of the fits to a smeared print in one image, of both attitudes together. If the steps
 #: do not suffice for the mirrored one, it is fitted in a later image.
 MAX_STEPS = 9

@@ -61,7 +61,7 @@ from flock_follower.perception.look import (
     straightened,
 )
 from flock_follower.perception.markers import Detections
-from flock_follower.perception.measurement import angle, Measurement, PosePrior
+from flock_follower.perception.measurement import images_unchecked, Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -69,18 +69,10 @@ from flock_follower.perception.neighbor_filter import (
     UpdateOutcome,
 )
 from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
-from flock_follower.perception.pose import locate, MAX_TURN, target, track
+from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranging, RangingParams
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 
-#: The mirrored attitude is fitted in every image while its chi^2 is within this of the other's.
-SETTLED_MARGIN = 100.0
-#: Images from one fit of the mirrored attitude to the next, otherwise.
-MIRRORED_EVERY = 30
-#: Images from one fit of the mirrored attitude of a smeared print to the next.
-SMEARED_EVERY = 3
-#: Probability of the mirrored attitude below which the other one is settled.
-SETTLED = 0.05
 #: Of a pose that another detector measured: it comes without an image.
 NO_IMAGE = CameraModel(np.eye(3), np.zeros(5), 'plumb_bob', 1, 1)
 
@@ -330,21 +322,11 @@ class Tracker:
         look.measured[name] = found
         unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
         if found.margin is not None:
-            unchecked[name] = self._images_unchecked(found, look.expected[name])
+            unchecked[name] = images_unchecked(found, look.expected[name])
         elif found.spacing is None and last is not None and last.spacing is not None:
             unchecked[name] = 0  # its edges decided until now
         elif unchecked[name]:
             unchecked[name] -= 1
-
-    def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
-        """Return the number of images until the mirrored attitude is checked again."""
-        assert found.margin is not None
-        if found.spacing is not None:
-            return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
-        # Both attitudes in one, with a margin of 0, may part soon.
-        settled = found.margin > 0.0 and found.doubt < SETTLED and expected.pose is not None and (
-            angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
-        return SMEARED_EVERY - 1 if settled else 0
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""

@@ -33,14 +33,9 @@ from flock_follower.perception import search
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import reported
-from flock_follower.perception.measurement import Measurement
+from flock_follower.perception.measurement import Measurement, MIRRORED_EVERY, SETTLED_MARGIN
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams
-from flock_follower.perception.tracker import (
-    camera_mounting,
-    MIRRORED_EVERY,
-    SETTLED_MARGIN,
-    Tracker,
-)
+from flock_follower.perception.tracker import camera_mounting, Tracker
 
 CAMERA = make_camera()
 MOUNTING = camera_mounting([0.10, 0.0, 0.02], [0.0, 0.1, 0.0])  # looking 6 deg down
