@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Conversion of messages to numpy and back, and the first check of their values.
+What messages hold in numpy, and what is plausible; the other modules convert them.
 
 NaN is refused by ``state_reader`` (neighbors), ``odometry.reader`` (odometry), ``planner.inputs``
 (every state), ``gate.setpoint_rules`` (everything that decides on a setpoint) and
