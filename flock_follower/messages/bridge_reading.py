@@ -23,13 +23,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from flock_follower.messages.bridge_state import (
-    BRIDGE_STATES,
-    INACTIVE,
-    LOST,
-    NO_AUTOPILOT,
-    TOPIC,
-)
+from flock_follower.messages.bridge_state import BRIDGE_STATES, INACTIVE, LOST, NO_AUTOPILOT, TOPIC
 
 SILENCE_MAX = 1.0  # s: two of the bridge's repetitions may get lost
 _LONGEST_REASON = 200  # characters

@@ -22,13 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import canonical_quaternion, quaternion_to_matrix
-from flock_follower.messages import (
-    Make,
-    OdometryState,
-    set_quaternion,
-    set_stamp,
-    set_vector,
-)
+from flock_follower.messages import Make, OdometryState, set_quaternion, set_stamp, set_vector
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 

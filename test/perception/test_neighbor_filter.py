@@ -43,11 +43,7 @@ from flock_follower.geometry.rotation_vectors import (
     rotation_vector_to_matrix,
 )
 from flock_follower.perception.innovation import ALIKE_TIME
-from flock_follower.perception.neighbor_filter import (
-    FilterParams,
-    NeighborFilter,
-    UpdateOutcome,
-)
+from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 
 
 def test_steady_flight_without_noise_is_found_exactly() -> None:
