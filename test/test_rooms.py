@@ -115,18 +115,18 @@ LOADED_PARTS = {
 LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',
           'flock_follower.planner.projection'}
 #: The most statements that each of them may load, without docstrings and imports. What each loads,
-#: by rooms, when the last function that it cannot reach had left it:
+#: by rooms, about:
 #:
-#: - relative_pose: perception 3412, nodes 780, odometry 649, parameters 342, messages 149;
-#: - planner: planner 1591, nodes 775, odometry 456, parameters 421, messages 157, flocking 65,
-#:   flock 34;
-#: - mavlink_bridge: mavlink 2364, gate 1267, nodes 1038, odometry 445, parameters 244, planner 171
-#:   (its limits), messages 130;
-#: - flock: nodes 556, odometry 445, parameters 165, flock 486, messages 89;
-#: - each, of geometry, ranges, signals and system: about 220.
+#: - relative_pose: perception 3400, nodes 780, odometry 650, parameters 340, messages 150;
+#: - planner: planner 1600, nodes 780, odometry 460, parameters 420, messages 160, flock and the
+#:   law 100;
+#: - mavlink_bridge: mavlink 2400, gate 1300, nodes 1000, odometry 450, parameters 240, the
+#:   planner's limits 170, messages 130;
+#: - flock: nodes 560, flock 490, odometry 450, parameters 170, messages 90;
+#: - each, of geometry, ranges, signals and system, 220.
 #:
-#: Each of them reads the odometry of any source by itself (445): one node that did this for all
-#: would add a hop, and its end would end all.
+#: Each of them reads the odometry of any source by itself: one node that did this for all would
+#: add a hop, and its end would end all.
 MOST_STATEMENTS = {
     'relative_pose': 5564, 'planner': 3716, 'mavlink_bridge': 5876, 'flock': 1958}
 
