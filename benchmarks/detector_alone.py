@@ -35,7 +35,6 @@ from poses import errors_of, pose_at, truth_of
 
 from flock_desk.camera.renderer import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.files import resource
 from flock_follower.geometry import Array, Transform
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.perception import markers
@@ -44,6 +43,7 @@ from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.perception.parameter_table import HAND_ACCELERATION, HAND_ANGULAR_NOISE
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.tracker import Tracker
+from flock_follower.system.files import resource
 
 OURS, LEADER = 'detector.launch.py', 'leader'
 TURNED = np.deg2rad(20.0)  # rad: a larger error of the attitude is counted

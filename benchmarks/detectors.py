@@ -32,7 +32,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 

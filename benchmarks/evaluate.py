@@ -35,10 +35,10 @@ import time
 
 from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_follower.bags.bag import BagError, deserialize, open_bag
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.images import compute_in_one_thread, decode_image
+from flock_follower.system.files import resource
 
 #: The aim is 3: perception, planner, gate and images alone take 2.4 of it.
 MOST = 4.5

@@ -43,12 +43,8 @@ from flock_desk.camera.renderer import (
     T_BODY_OPTICAL,
 )
 from flock_desk.marker import layout, neighbors_file, SIZES
-from flock_follower.geometry import (
-    Array,
-    IDENTITY_QUATERNION,
-    rotation_vector_to_matrix,
-    Transform,
-)
+from flock_follower.geometry import Array, IDENTITY_QUATERNION, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.parameters.neighbors_file import Marker, NeighborConfig
 from flock_follower.perception.camera import CameraModel

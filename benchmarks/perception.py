@@ -69,14 +69,10 @@ from flock_desk.sample_bag import (
 )
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.bags.writer import BagWriter
-from flock_follower.files import resource
-from flock_follower.geometry import Array, slerp, Transform
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    OdometryState,
-    stamp_to_nanoseconds,
-)
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import slerp
+from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.odometry.buffer import OdometryBuffer
 from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.perception import markers as neighbors
@@ -86,6 +82,7 @@ from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 from flock_follower.planner.params import PlannerParams
+from flock_follower.system.files import resource
 
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
 SHORT = 100  # images of a flight that is rendered only to measure time

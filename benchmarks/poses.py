@@ -28,9 +28,11 @@ import sys
 import numpy as np
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.messages import from_odometry, NANOSECONDS
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
+from flock_follower.messages import NANOSECONDS
 from flock_follower.messages.poses import from_pose, pose_topic
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.odometry.buffer import interpolate, OdometrySample
 from flock_follower.perception.tracker import camera_mounting
 

@@ -55,7 +55,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_desk.program import PROGRAMS
 from flock_desk.runs.processes import free_udp_port, private_environment, Processes
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
 
 NODES = ('relative_pose', 'planner', 'mavlink_bridge')
 MOST = 0.8  # times the CPU time of the bare nodes

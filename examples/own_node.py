@@ -25,7 +25,7 @@ from rclpy.executors import ExternalShutdownException
 import rclpy.node
 from rclpy.qos import qos_profile_sensor_data as sensor_qos
 
-from flock_follower.messages import from_odometry
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 

@@ -36,12 +36,12 @@ from typing import Any
 from flock_desk.runs.console import guarded, within
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
 from flock_desk.vehicles.profiles import PROFILES
-from flock_follower.files import read_text
 from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
 from flock_follower.signals import ending
+from flock_follower.system.files import read_text
 
 
 def parser() -> argparse.ArgumentParser:

@@ -49,13 +49,14 @@ from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.checks.processor import Load
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import from_odometry, OdometryState
+from flock_follower.messages import OdometryState
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.parameters.files import parameters_flown
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import PlannerParams
+from flock_follower.system.files import resource
 
 BAG = resource('bags/sample')
 PLAYED = ['/image_raw/compressed', '/camera_info', '/odom']

@@ -52,11 +52,11 @@ from flock_desk.runs.processes import computed
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import evaluation_figures
 from flock_follower.checks.findings import ERROR, Finding, ready, WARNING
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.messages.topic_names import parse_remaps
 from flock_follower.parameters.files import parameters_flown, read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.images import compute_in_one_thread
+from flock_follower.system.files import resource
 
 
 class BagOutcome(NamedTuple):

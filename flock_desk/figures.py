@@ -43,8 +43,8 @@ from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs import paper_plots as plots
 from flock_desk.runs.console import aligned, guarded, progress
-from flock_follower.files import read_text
-from flock_follower.whole_file import whole_file
+from flock_follower.system.files import read_text
+from flock_follower.system.whole_file import whole_file
 
 MODELS: dict[Model, str] = {
     'flocking': 'Flocking law',

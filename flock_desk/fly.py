@@ -80,7 +80,7 @@ from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEED_RANGE
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
 from flock_follower.messages.bridge_state import TAKEN_OVER
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
 SPEED_TOLERANCE = 0.05  # m/s: added by noise and gusts to a speed that is held at v_max

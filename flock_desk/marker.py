@@ -47,7 +47,7 @@ from flock_desk.runs.console import guarded
 from flock_follower.parameters.neighbors_file import SIDE_LENGTHS
 from flock_follower.perception.markers import dictionary_size, draw_marker, marker_cells
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 #: Width and height, mm.
 PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}

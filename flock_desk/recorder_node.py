@@ -32,8 +32,8 @@ from rclpy.qos import QoSProfile
 from flock_follower.bags.bag import BagError
 from flock_follower.bags.mcap_file import incomplete
 from flock_follower.bags.writer import BagWriter
-from flock_follower.nodes import no_exit_deadline
 from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.exit_deadline import no_exit_deadline
 from flock_follower.nodes.support.process import run, spin
 
 

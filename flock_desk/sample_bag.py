@@ -48,7 +48,7 @@ from flock_desk.sensors.vio import Odometry, odometry, true_odometry
 from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
-from flock_follower.messages import odometry as odometry_message
+from flock_follower.messages.state_writer import odometry as odometry_message
 from flock_follower.parameters.files import FLOWN
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.ranges import Range

@@ -37,7 +37,8 @@ from flock_desk.closed_loop.real_time_flight import RenderedImage
 from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_desk.sensors.vio import Odometry as TrueMotion
 from flock_follower.geometry import normalize_quaternion
-from flock_follower.messages import from_odometry, odometry
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import Rate
 from flock_follower.nodes.support.runtime import FlockNode

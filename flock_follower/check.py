@@ -56,12 +56,12 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag, judge_all
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.messages.topic_names import parse_remaps
 from flock_follower.parameters.files import parameters_flown, read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
+from flock_follower.system.files import resource
+from flock_follower.system.whole_file import whole_file
 
 LISTENING_TIME = 6.0  # s
 VALID_SECONDS = Range(1.0, 600.0, 's')

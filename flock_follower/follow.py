@@ -35,7 +35,7 @@ import sys
 from flock_follower.check import LISTENING_TIME, table
 from flock_follower.checks.findings import ready
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.messages.bridge_state import FLYING, read_flag
+from flock_follower.messages.bridge_diagnostics import FLYING, read_flag
 from flock_follower.signals import show_error
 
 

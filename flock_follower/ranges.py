@@ -69,9 +69,6 @@ class Range:
             raise ValueError(f'{name} = {shown}: must be {self}')
 
 
-#: Time between two messages of a recording, s; if it is more, the clock was set or nothing was
-#: recorded.
-MAX_GAP = 5.0
 #: Largest offset between the clocks of images and odometry that is applied, s.
 MAX_OFFSET: Final[float] = 0.2
 #: Largest error of the hover thrust that the gate offsets, m/s^2.

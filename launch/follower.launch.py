@@ -32,7 +32,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 import yaml
 
-from flock_follower.flight_parameters import refuse_start
+from flock_follower.parameters.flight_parameters import refuse_start
 from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_arguments
 
 ARGUMENTS = {

@@ -22,7 +22,7 @@ from typing import Any
 
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
-from flock_follower.files import resource
+from flock_follower.system.files import resource
 
 SAMPLE = resource('bags/sample')
 Change = Callable[[BagMessage], BagMessage | None]

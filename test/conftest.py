@@ -44,7 +44,7 @@ import pytest
 
 from flock_desk.runs.processes import private_environment
 from flock_follower.checks.processor import children, LOAD_PERIOD, LoadMeter
-from flock_follower.fast_dds import profile_variables
+from flock_follower.system.fast_dds import profile_variables
 
 HERE = Path(__file__).resolve().parent
 

@@ -27,7 +27,8 @@ from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-from flock_follower.messages import odometry, stamp_to_nanoseconds
+from flock_follower.messages import stamp_to_nanoseconds
+from flock_follower.messages.state_writer import odometry
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 
 START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
@@ -45,7 +46,7 @@ def as_taken(subscription: Subscription, message: Any) -> Any:
 
 
 def to_odometry(stamp: Time, *fields: Any) -> Any:
-    """Return an Odometry message of rclpy; for the fields see ``messages.odometry``."""
+    """Return an Odometry message of rclpy; for the fields see ``state_writer.odometry``."""
     return odometry(make, stamp_to_nanoseconds(stamp), *fields)
 
 

@@ -33,7 +33,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk import autopilot
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP_TIME
-from flock_follower.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
+from flock_follower.mavlink.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,14 @@ from pathlib import Path
 import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.files import resource
-from flock_follower.messages import from_odometry, stamp_to_nanoseconds
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages import stamp_to_nanoseconds
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.parameter_table import RELATIVE_POSE, tracker
 from flock_follower.perception.pending_images import Perceiver
+from flock_follower.system.files import resource
 
 GOLDEN = Path(__file__).resolve().parent / 'frozen' / 'sample.csv'
 BAG = resource('bags/sample')
@@ -49,8 +50,8 @@ def result() -> list[Row]:
     """
     # Here, because where only perception is installed the rest of the chain is not.
     from flock_desk.runs.evaluation import evaluate
-    from flock_follower.flight_parameters import TABLE
     from flock_follower.parameters.files import read_parameters
+    from flock_follower.parameters.flight_parameters import TABLE
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'result.mcap'

@@ -46,9 +46,10 @@ from flock_desk.runs.processes import (
 )
 from flock_follower.bags.bag import Bag, deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
-from flock_follower.files import resource
 from flock_follower.geometry import Array
-from flock_follower.messages import from_odometry, NANOSECONDS
+from flock_follower.messages import NANOSECONDS
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.system.files import resource
 
 VICTIMS = ('planner', 'relative_pose', 'replay')
 LIMIT = 0.3  # s

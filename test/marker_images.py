@@ -23,7 +23,8 @@ from typing import Any, NamedTuple, TypeVar
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception import markers

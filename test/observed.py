@@ -40,8 +40,6 @@ from flock_follower.checks.observations import (
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.geometry import (
     Array,
     quaternion_conjugate,
@@ -50,12 +48,14 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
     R_FLU_OPTICAL,
-    rotation_vector_to_matrix,
 )
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.messages.topic_names import names_there, OURS, TYPES
 from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.camera import CameraModel
+from flock_follower.system.files import resource
 
 START = 1_700_000_000.0  # s
 SECONDS = 5.0

@@ -31,7 +31,8 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 import yaml
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
+from flock_follower.geometry import Array, skew, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.camera import CameraModel

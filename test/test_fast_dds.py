@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 from flock_follower.checks.system import ADVICE
-from flock_follower.fast_dds import UNDELIVERED, undelivered
+from flock_follower.system.fast_dds import UNDELIVERED, undelivered
 
 OWN = ['/dev/shm/fastrtps_ab_el', '/dev/shm/fastrtps_port7001_el', 'socket:[17]']
 

@@ -37,7 +37,8 @@ from flock_follower.flocking import (
     lyapunov,
     separation,
 )
-from flock_follower.geometry import Array, rotation_vector_to_matrix
+from flock_follower.geometry import Array
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 
 FLIGHT = FlockingParams(beta=0.25, d1=8.0)
 

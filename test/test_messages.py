@@ -24,18 +24,15 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix
-from flock_follower.messages import (
-    from_odometry,
-    from_state,
-    jump,
-    Make,
-    odometry,
-    RELATIVE,
-    SANE,
-    stamp_age,
-)
-from flock_follower.messages.accelerations import acceleration, from_acceleration
-from flock_follower.messages.commands import Command, from_trajectory, trajectory
+from flock_follower.messages import Make, RELATIVE, SANE, stamp_age
+from flock_follower.messages.accelerations import from_acceleration
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
+from flock_follower.messages.jumps import jump
+from flock_follower.messages.poses import acceleration
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import from_state, odometry
 from flock_follower.odometry.reader import OdometrySource
 
 

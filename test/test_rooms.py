@@ -35,8 +35,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
-#: Modules beside the folders that every room may import.
-SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'signals', 'whole_file'}
+#: The modules beside the folders, and the folder, that every room may import.
+SHARED = {'geometry', 'ranges', 'signals', 'system'}
+#: Modules that are rooms of their own: the simulated vehicles share the frames of MAVLink with the
+#: bridge, and nothing else; no node loads the tables of all nodes.
+APART = {'flock_follower.mavlink.ned', 'flock_follower.parameters.flight_parameters'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
@@ -99,13 +102,14 @@ LOADED_ROOMS = {
     'mavlink_bridge': f'gate mavlink ned planner {_ALL_LOAD}',
     'flock': f'flock {_ALL_LOAD}',
 }
-#: The messages that each of them loads, beside odometry, and whether the file of the neighbors:
-#: the markers by name and size alone.
+#: The messages that each of them loads, and whether the file of the neighbors: the markers by name
+#: and size alone.
 LOADED_PARTS = {
-    'relative_pose': 'accelerations neighbors_file poses',
-    'planner': 'accelerations bridge_state commands neighbors_file',
-    'mavlink_bridge': 'bridge_state commands',
-    'flock': '',
+    'relative_pose': 'neighbors_file poses state_reader state_writer',
+    'planner': 'accelerations bridge_reading bridge_state command_writer commands jumps '
+               'neighbors_file state_reader',
+    'mavlink_bridge': 'bridge_diagnostics bridge_state command_reader commands jumps state_writer',
+    'flock': 'jumps state_reader state_writer',
 }
 #: What the gate needs of the planner.
 LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',
@@ -145,12 +149,13 @@ def room_of(name: str, path: Path) -> str:
     """
     Return the innermost folder of a module; of a module beside the folders its own name.
 
-    The modules beside the folders of the desk are commands, one room, unless the plan names them.
+    The modules beside the folders of the desk are commands, one room. A module whose own imports
+    differ from those of its folder is a room of its own: ``APART``.
     """
-    package, *folders = name.split('.') if path.stem == '__init__' else name.split('.')[:-1]
-    if folders:
-        return folders[-1]
     own = name.rpartition('.')[2]
+    package, *folders = name.split('.') if path.stem == '__init__' else name.split('.')[:-1]
+    if folders and name not in APART:
+        return folders[-1]
     return own if package == 'flock_follower' or own in ROOMS else package
 
 
@@ -281,7 +286,7 @@ def test_a_flight_node_loads_no_more_than_now(node):
 def test_no_node_loads_the_tables_of_all():
     assert not [name for name, module in read_house().items()
                 if module.room in ('nodes', 'support')
-                and 'flock_follower.flight_parameters' in loaded(name)]
+                and 'flock_follower.parameters.flight_parameters' in loaded(name)]
 
 
 def test_the_law_loads_geometry_and_ranges_alone():

@@ -19,7 +19,7 @@ from pathlib import Path
 from full_disk import disk_of
 import pytest
 
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 
 def test_a_file_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:

@@ -35,7 +35,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flock_desk.camera.lens import Camera
-from flock_follower.geometry import Array, R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Array, R_FLU_OPTICAL, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.perception.markers import draw_marker, marker_cells
 
 Image = NDArray[np.float32]

@@ -39,7 +39,8 @@ from flock_desk.closed_loop.real_time_flight import (
     RenderedImage,
     STEP_NS,
 )
-from flock_desk.follower import ControlCycle, Follower, Listener, Tick
+from flock_desk.follower import Follower
+from flock_desk.follower.outcomes import ControlCycle, Listener, Tick
 from flock_desk.scenarios.scenario import Part, Scenario
 from flock_desk.sensors.sensing import facing, in_view, PerceptionNoise
 from flock_desk.sensors.vio import Due, Odometry
@@ -48,11 +49,14 @@ from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE
 from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
-from flock_follower.geometry import quaternion_to_matrix, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import quaternion_to_matrix, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
-from flock_follower.messages import from_odometry, Make, NANOSECONDS, odometry
+from flock_follower.messages import Make, NANOSECONDS
 from flock_follower.messages.poses import from_pose, pose_with_covariance, PoseState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 from flock_follower.parameters.neighbors_file import parse
 from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.perception.observed_wait import MAX_WAIT

@@ -34,10 +34,10 @@ from flock_desk.vehicles.px4 import OFFBOARD
 from flock_follower.geometry import (
     Array,
     matrix_to_quaternion,
-    matrix_to_rotation_vector,
     quaternion_to_matrix,
     yaw_from_quaternion,
 )
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
 
 #: The values of config/px4.params that differ from PX4's defaults.
 RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3,

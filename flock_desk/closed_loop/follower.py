@@ -35,7 +35,8 @@ import numpy as np
 
 from flock_desk.closed_loop.camera_views import MARKER_TILT, Sighted, YAW_NOISE
 from flock_desk.closed_loop.world import GATE_STEPS
-from flock_desk.follower import ControlCycle, Follower, Listener, Tick
+from flock_desk.follower import Follower
+from flock_desk.follower.outcomes import ControlCycle, Listener, Tick
 from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import ENGAGE_TIME, Operation, Scenario, VioErrors
 from flock_desk.sensors.sensing import DIRECTIONS

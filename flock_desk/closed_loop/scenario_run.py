@@ -28,11 +28,11 @@ from flock_follower.geometry import (
     Array,
     GRAVITY,
     matrix_to_quaternion,
-    matrix_to_rotation_vector,
     quaternion_from_yaw,
     Transform,
     yaw_from_quaternion,
 )
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
 
 WIND_PERIOD = 0.05  # s between changes of the wind
 PROCESSING = 0.02  # s from an image's exposure to the planner if nothing delays it

@@ -28,9 +28,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, slerp
+from flock_follower.geometry import Array
+from flock_follower.geometry.rotation_vectors import slerp
+from flock_follower.mavlink.ned import ned_to_enu
 from flock_follower.mavlink.telemetry import decode_attitude
-from flock_follower.ned import ned_to_enu
 
 SIM_STATE: Final[str] = 'SIM_STATE'
 HIL_STATE: Final[str] = 'HIL_STATE_QUATERNION'

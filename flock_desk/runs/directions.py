@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.messages import OdometryState, RELATIVE
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
 
 SAME_TIME_NS = 50_000_000  # between an estimate and the odometry that places it
 #: A setpoint rests on a command that arrived at most this long before, s.

@@ -35,7 +35,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_desk.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
+from flock_desk.follower import Follower
+from flock_desk.follower.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_desk.runs.decoding import decoded_ahead
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
@@ -46,22 +47,16 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
-from flock_follower.files import resource
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
 from flock_follower.geometry import Array
 from flock_follower.mavlink.parameter_table import gate_limits
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    ODOMETRY,
-    OdometryState,
-    read_stamp,
-    STATE,
-)
-from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, STATE
+from flock_follower.messages.command_writer import TRAJECTORY
 from flock_follower.messages.poses import from_pose, from_range, POSE_TYPES, stamp_of
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
@@ -81,6 +76,7 @@ from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.parameter_table import planner_params
+from flock_follower.system.files import resource
 
 STATES = tuple(state.value for state in State)
 #: The assumed status of the autopilot while the bag was recorded.

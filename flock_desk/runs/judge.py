@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from flock_follower.files import read_text
+from flock_follower.system.files import read_text
 
 #: Keys under which anything may appear, a count of 0 unless it does.
 COUNTERS = ('rejections.', 'setpoints.reasons.')

@@ -33,13 +33,10 @@ from flock_desk.runs.judge import judge
 from flock_desk.runs.summary import mean
 from flock_desk.scenarios.scenario import LeaderMotion, Leg, Scenario, Start
 from flock_follower.bags.message_types import empty
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    ODOMETRY,
-    OdometryState,
-)
-from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.messages.command_writer import TRAJECTORY
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 
 OFFBOARD_TIME = 2.5  # s in offboard mode
 #: The leader leaves at once, faster than the default v_max: all commands point one way.

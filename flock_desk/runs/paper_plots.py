@@ -37,7 +37,7 @@ import numpy as np
 
 from flock_desk.flocks.agents import Simulation
 from flock_follower.flocking import FlockingParams
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 COLUMN_WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the color-blind, and a dash for each, for print without color.

@@ -49,8 +49,8 @@ from flock_follower.checks.processor import (
     waits_of,
 )
 from flock_follower.checks.reach import PORTS_FROM, PORTS_PER_DOMAIN
-from flock_follower.fast_dds import profile_variables
 from flock_follower.signals import ending
+from flock_follower.system.fast_dds import profile_variables
 
 TOO_BUSY_EXIT_CODE = 3
 LONGEST_STOP = 60.0  # s until a process is killed, however long it waits for a processor

@@ -35,14 +35,9 @@ from flock_desk.runs.processes import LateError
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    OdometryState,
-    RELATIVE,
-    stamp_to_nanoseconds,
-)
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages import NANOSECONDS, OdometryState, RELATIVE, stamp_to_nanoseconds
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.neighbors_file import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate

@@ -36,7 +36,7 @@ from flock_desk.runs.judge import FigureBound, flat, judge, Judgment
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE
 from flock_desk.runs.summary import consistency, write_summary
 from flock_follower.checks.processor import Load
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto;

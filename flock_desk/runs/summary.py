@@ -40,7 +40,7 @@ from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.checks.processor import Load
 from flock_follower.geometry import Array
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 #: Attitudes farther than this from the truth count as wrong, rad.
 WRONG_ATTITUDE = math.radians(20.0)

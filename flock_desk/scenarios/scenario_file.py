@@ -45,7 +45,7 @@ import yaml
 
 from flock_desk.scenarios.courses import course
 from flock_desk.scenarios.scenario import Scenario
-from flock_follower.files import resource
+from flock_follower.system.files import resource
 
 FOLDER = 'config/scenarios'
 _VARIANTS = 'variants'

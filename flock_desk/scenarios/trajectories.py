@@ -41,10 +41,10 @@ from flock_follower.geometry import (
     quaternion_multiply,
     quaternion_to_rotation_vector,
     rotation_vector_to_quaternion,
-    slerp,
     Transform,
     wrap_angle,
 )
+from flock_follower.geometry.rotation_vectors import slerp
 from flock_follower.planner.limits import limit_command
 
 #: Time between samples of a track, s.

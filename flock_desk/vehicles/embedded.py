@@ -40,7 +40,7 @@ from flock_desk.vehicles.profiles import Parameters, PROFILES
 from flock_desk.vehicles.px4 import Px4
 from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import Array
-from flock_follower.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
+from flock_follower.mavlink.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
 STEP_TIME: Final[float] = 0.01  # s
 STARTS: Final[tuple[str, ...]] = ('airborne', 'armed', 'landed')

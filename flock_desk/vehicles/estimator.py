@@ -41,7 +41,7 @@ from flock_follower.geometry import (
     wrap_angle,
     yaw_from_quaternion,
 )
-from flock_follower.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
+from flock_follower.mavlink.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
 
 #: A gap in the vision longer than this, s, makes it stale: PX4's EKF2 stops using it then.
 VISION_TIMEOUT: Final[float] = 0.2

@@ -38,7 +38,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     wrap_angle,
 )
-from flock_follower.ned import ned_to_enu, yaw_ned_to_enu
+from flock_follower.mavlink.ned import ned_to_enu, yaw_ned_to_enu
 
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
 VELOCITY_GAIN: Final[Array] = np.array([1.8, 1.8, 4.0])

@@ -22,8 +22,8 @@ from typing import Any, Final
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.ned import ned_to_enu, yaw_ned_to_enu
-from flock_follower.whole_file import whole_file
+from flock_follower.mavlink.ned import ned_to_enu, yaw_ned_to_enu
+from flock_follower.system.whole_file import whole_file
 
 #: The true state is logged this often, Hz.
 STATE_RATE: Final[float] = 50.0

@@ -27,7 +27,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import Array, GRAVITY, matrix_to_quaternion, matrix_to_rotation_vector
+from flock_follower.geometry import Array, GRAVITY, matrix_to_quaternion
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
 
 _UP_ENU: Final[Array] = np.array([0.0, 0.0, 1.0])
 _HOVER_FORCE: Final[Array] = GRAVITY * _UP_ENU  # m/s^2, specific

@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 import zlib
 
 from flock_follower.bags.message_types import typestore
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 #: The first and the last bytes of every MCAP file.
 MCAP_MAGIC = b'\x89MCAP0\r\n'

@@ -41,7 +41,7 @@ from flock_follower.bags.mcap_file import (
     TakenMessage,
 )
 from flock_follower.bags.schedule import NS_PER_S
-from flock_follower.whole_file import whole_file
+from flock_follower.system.whole_file import whole_file
 
 #: The name of the folder of a recording; the group is its number.
 NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')

@@ -24,9 +24,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from flock_follower.ranges import MAX_GAP
-
 NS_PER_S = 1_000_000_000
+#: Time between two messages of a recording, s; if it is more, the clock was set or nothing was
+#: recorded.
+MAX_GAP = 5.0
 
 
 class Section(NamedTuple):

@@ -22,7 +22,7 @@ from pathlib import Path
 import time
 from typing import Final
 
-from flock_follower.fast_dds import lock_files, SHARED_MEMORY
+from flock_follower.system.fast_dds import lock_files, SHARED_MEMORY
 
 #: A younger lock may be one whose process is about to lock it, s.
 _YOUNG: Final = 10.0

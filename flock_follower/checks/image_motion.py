@@ -36,12 +36,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import (
-    Array,
-    quaternion_to_matrix,
-    rotation_vector_to_matrix,
-    skew,
-)
+from flock_follower.geometry import Array, quaternion_to_matrix, skew
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flock_follower.bags.schedule import MAX_GAP
 from flock_follower.checks.pose_path import PosePath
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
@@ -40,7 +41,6 @@ from flock_follower.messages.topic_names import COMPRESSED_IMAGES, full_name, RA
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.perception.prints import Fault
-from flock_follower.ranges import MAX_GAP
 
 
 class TopicEnd(NamedTuple):

@@ -41,9 +41,9 @@ from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
     quaternion_to_matrix,
-    rotation_vector_to_matrix,
     rpy_from_matrix,
 )
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
 from flock_follower.parameters.cameras import ALONE
 from flock_follower.parameters.files import COMMON

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
-from flock_follower.bags.schedule import Gaps
+from flock_follower.bags.schedule import Gaps, MAX_GAP
 from flock_follower.checks.collector import Collector, POSES
 from flock_follower.checks.findings import Finding, without_consequences
 from flock_follower.checks.flight_settings import check_settings
@@ -31,9 +31,9 @@ from flock_follower.checks.pictures import check_pictures
 from flock_follower.checks.single_camera import select_camera
 from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.topics import check_nodes, check_topics
-from flock_follower.files import resource
-from flock_follower.messages import NANOSECONDS, ODOMETRY
+from flock_follower.messages import NANOSECONDS
 from flock_follower.messages.poses import POSE_TYPES
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
@@ -46,7 +46,7 @@ from flock_follower.messages.topic_names import (
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.markers import load
-from flock_follower.ranges import MAX_GAP
+from flock_follower.system.files import resource
 
 #: s: of a longer bag only the beginning is checked.
 MAX_DURATION: Final = 300.0

@@ -30,8 +30,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Machine, Observations
 from flock_follower.checks.processor import BUSY_SHARE
-from flock_follower.fast_dds import PROFILE_VARIABLES, UNDELIVERED
-from flock_follower.messages.bridge_state import (
+from flock_follower.messages.bridge_diagnostics import (
     ARMED,
     LINK_FAULT,
     MISSING,
@@ -45,6 +44,7 @@ from flock_follower.messages.bridge_state import (
     UNREAD,
 )
 from flock_follower.messages.topic_names import full_name, OURS
+from flock_follower.system.fast_dds import PROFILE_VARIABLES, UNDELIVERED
 
 STARVED_SHARE = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from flock_follower.bags.schedule import MAX_GAP
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -40,7 +41,6 @@ from flock_follower.messages.topic_names import (
     TYPES,
 )
 from flock_follower.parameters.sections import listed_files
-from flock_follower.ranges import MAX_GAP
 
 #: Only one node may publish these.
 ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',

@@ -30,7 +30,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle, yaw_from_quaternion
-from flock_follower.messages import FASTEST, jump, NANOSECONDS, ODOMETRY_JUMP, OdometryState
+from flock_follower.messages import FASTEST, NANOSECONDS, OdometryState
+from flock_follower.messages.jumps import jump, ODOMETRY_JUMP
 
 #: A vehicle's name: it goes into frame ids, and comes from a namespace. Its frame is NAME/odom.
 NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')

@@ -38,15 +38,15 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.mavlink.dialects import Dialect
+from flock_follower.mavlink.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 from flock_follower.messages import (
     FUTURE_TOLERANCE,
-    jump,
     ODOMETRY_STD,
     OdometryState,
     POSITION_JUMP,
     SANE,
 )
-from flock_follower.ned import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
+from flock_follower.messages.jumps import jump
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is an error, s.
 FORWARDING_GAP: Final[float] = 0.1

@@ -20,7 +20,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from flock_follower.files import resource
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.flight_end import EndParams
 from flock_follower.gate.motion_sources import VELOCITY_SOURCES
@@ -32,6 +31,7 @@ from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.settings import refuse
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.ranges import Range
+from flock_follower.system.files import resource
 
 ORIGIN_RANGES = {
     'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.ned import enu_to_ned, yaw_enu_to_ned
+from flock_follower.mavlink.ned import enu_to_ned, yaw_enu_to_ned
 
 #: Acceleration only, 0xC3F: for as long as no yaw is known.
 ACCELERATION: Final[int] = (

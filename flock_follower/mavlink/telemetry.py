@@ -45,8 +45,8 @@ from flock_follower.mavlink.estimator_health import (
     gps_fix,
     GpsFix,
 )
+from flock_follower.mavlink.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
 from flock_follower.messages import OdometryState
-from flock_follower.ned import frd_to_flu, ned_to_enu, quaternion_ned_frd_to_enu_flu
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0

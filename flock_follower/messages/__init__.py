@@ -15,9 +15,9 @@
 """
 Conversion of messages to numpy and back, and the first check of their values.
 
-NaN is refused by ``from_odometry`` here (neighbors), ``odometry.reader`` (odometry),
-``planner.inputs`` (every state), ``gate.setpoint_rules`` (everything that decides on a setpoint)
-and ``mavlink.setpoint_encoding`` (the wire).
+NaN is refused by ``state_reader`` (neighbors), ``odometry.reader`` (odometry), ``planner.inputs``
+(every state), ``gate.setpoint_rules`` (everything that decides on a setpoint) and
+``mavlink.setpoint_encoding`` (the wire).
 
 The functions work with any message classes: rclpy's in the nodes, the type store's when bags are
 read. To build a message, the caller passes ``make``, which returns an empty message of a type such
@@ -27,24 +27,17 @@ as 'nav_msgs/msg/Odometry'.
 from __future__ import annotations
 
 from collections.abc import Callable
-import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import (
-    Array,
-    canonical_quaternion,
-    normalize_quaternion,
-    quaternion_to_matrix,
-)
+from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
 NANOSECONDS = 1_000_000_000
 _NANOSEC = Range(0, NANOSECONDS - 1, whole=True)
 
-ODOMETRY = 'nav_msgs/msg/Odometry'
 STATE = 'std_msgs/msg/String'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
@@ -70,11 +63,6 @@ POSITION_JUMP = 0.3
 FUTURE_TOLERANCE = 0.1
 #: s: a stamp farther back is a new start (a bag played again), not a message out of order.
 MAX_JUMP = 0.5
-#: m: odometry farther from its prediction has another frame than before: places in the old frame
-#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source. ``jump``
-#: is the rule. Two others predict otherwise: ``derivation`` has positions alone, and
-#: ``velocity_check.Path`` allows for motion in a gap.
-ODOMETRY_JUMP = 0.25
 #: m: a neighbor's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5
 #: Standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
@@ -167,94 +155,3 @@ class OdometryState(NamedTuple):
         turned: Array = self.twist_rotation.dot(self.twist_covariance[:3, :3]).dot(
             self.twist_rotation.T)
         return turned
-
-
-class Moving(Protocol):
-    """A state with a position (3,), m, and a velocity (3,), m/s."""
-
-    @property
-    def position(self) -> Array:
-        """Return the position."""
-
-    @property
-    def velocity(self) -> Array:
-        """Return the velocity."""
-
-
-def jump(before: Moving, after: Moving, elapsed: float, tolerance: float) -> float:
-    """
-    Return the distance, m, of a position from its prediction if it exceeds a tolerance, else 0.
-
-    The prediction is from ``elapsed`` s before, with the mean of both velocities: exact for a
-    constant acceleration.
-    """
-    distance = math.dist(after.position.tolist(), [
-        x + 0.5 * elapsed * (v + w) for x, v, w in zip(
-            before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())])
-    return distance if distance > tolerance else 0.0
-
-
-def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
-    """
-    Return the state of an Odometry message, its velocity in the header's frame.
-
-    ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
-    that put the linear velocity in the header's frame.
-
-    :raises ValueError: if position, attitude or velocity is not finite, or beyond ``SANE``, or
-        the stamp is invalid.
-    """
-    pose, twist = message.pose.pose, message.twist.twist
-    x = pose.orientation
-    stamp, q = read_stamp(message.header.stamp), normalize_quaternion([x.x, x.y, x.z, x.w])
-    position, linear, angular = map(to_array, (pose.position, twist.linear, twist.angular))
-    for name, value in (('position', position), ('linear velocity', linear),
-                        ('angular velocity', angular)):
-        if not all(abs(number) <= SANE for number in value.tolist()):  # written so that NaN fails
-            raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
-    rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
-    return OdometryState(
-        stamp, message.header.frame_id, message.child_frame_id, position, q, rotation.dot(linear),
-        angular, np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
-        np.asarray(message.twist.covariance, dtype=float).reshape(6, 6), rotation)
-
-
-def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike,
-             quaternion: ArrayLike, velocity_child: ArrayLike,
-             angular_velocity_child: ArrayLike = (0.0, 0.0, 0.0),
-             pose_covariance: Any = None, twist_covariance: Any = None) -> Any:
-    """
-    Return an Odometry message; the twist is given, and sent, in the child frame (REP-105).
-
-    ``stamp`` in ns. Covariances are (6, 6), in the order x, y, z, rotations about x, y, z. None
-    becomes zeros, which means unknown.
-    """
-    message = make(ODOMETRY)
-    set_stamp(message.header.stamp, stamp)
-    message.header.frame_id = frame
-    message.child_frame_id = child
-    set_vector(message.pose.pose.position, position)
-    set_quaternion(message.pose.pose.orientation, canonical_quaternion(quaternion))
-    set_vector(message.twist.twist.linear, velocity_child)
-    set_vector(message.twist.twist.angular, angular_velocity_child)
-    if pose_covariance is not None:
-        message.pose.covariance = np.asarray(pose_covariance, dtype=float).reshape(36)
-    if twist_covariance is not None:
-        message.twist.covariance = np.asarray(twist_covariance, dtype=float).reshape(36)
-    return message
-
-
-def from_state(make: Make, state: OdometryState) -> Any:
-    """Return the Odometry message of a state, its twist in the child frame (REP-105)."""
-    to_child = quaternion_to_matrix(state.quaternion).T
-    twist = state.twist_covariance.copy()
-    twist[:3, :3] = to_child.dot(state.velocity_covariance).dot(to_child.T)
-    return odometry(make, state.stamp, state.frame, state.child, state.position,
-                    state.quaternion, to_child.dot(state.velocity), state.angular_velocity,
-                    state.pose_covariance, twist)
-
-
-def twist(make: Make, linear: ArrayLike) -> Any:
-    message = make('geometry_msgs/msg/Twist')
-    set_vector(message.linear, linear)
-    return message

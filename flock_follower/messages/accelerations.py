@@ -12,37 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Conversion of the accelerations of neighbors to messages and back; see ``messages``."""
+"""Accelerations of neighbors, from the messages of perception (``poses.acceleration``)."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, quaternion_to_matrix
-from flock_follower.messages import Make, OdometryState, read_stamp, SANE, set_stamp, set_vector
-
-ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
-
-
-def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
-                 covariance: ArrayLike) -> Any:
-    """
-    Return an AccelWithCovarianceStamped of a neighbor, in its own frame ``child``.
-
-    ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). The angular acceleration is
-    unknown: its covariance is -1.
-    """
-    message = make(ACCELERATION)
-    set_stamp(message.header.stamp, stamp)
-    message.header.frame_id = child
-    set_vector(message.accel.accel.linear, vector)
-    full = np.zeros((6, 6))
-    full[:3, :3], full[3, 3] = covariance, -1.0
-    message.accel.covariance = full.reshape(36)
-    return message
+from flock_follower.messages import OdometryState, read_stamp, SANE
 
 
 class AccelerationState(NamedTuple):

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Poses of neighbors, and ranges to them, as messages of other packages; see ``messages``."""
+"""What perception takes and publishes beside Odometry: poses, accelerations, ranges."""
 
 from __future__ import annotations
 
@@ -23,18 +23,20 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, canonical_quaternion, Transform
 from flock_follower.messages import (
     Make,
-    ODOMETRY,
     read_stamp,
     set_quaternion,
     set_stamp,
     set_vector,
     to_array,
 )
+from flock_follower.messages.state_writer import ODOMETRY
 
+ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 #: Types of the poses of other detectors, the best first.
 POSE_TYPES = (POSE, 'geometry_msgs/msg/PoseStamped', ODOMETRY)
@@ -65,6 +67,24 @@ def pose_with_covariance(make: Make, stamp: int, frame: str, pose: Transform,
     set_vector(message.pose.pose.position, pose.translation)
     set_quaternion(message.pose.pose.orientation, canonical_quaternion(pose.quaternion))
     message.pose.covariance = np.asarray(covariance, dtype=float).reshape(36)
+    return message
+
+
+def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
+                 covariance: ArrayLike) -> Any:
+    """
+    Return an AccelWithCovarianceStamped of a neighbor, in its own frame ``child``.
+
+    ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). The angular acceleration is
+    unknown: its covariance is -1.
+    """
+    message = make(ACCELERATION)
+    set_stamp(message.header.stamp, stamp)
+    message.header.frame_id = child
+    set_vector(message.accel.accel.linear, vector)
+    full = np.zeros((6, 6))
+    full[:3, :3], full[3, 3] = covariance, -1.0
+    message.accel.covariance = full.reshape(36)
     return message
 
 

@@ -19,8 +19,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from flock_follower.messages import ODOMETRY, STATE
-from flock_follower.messages.commands import TRAJECTORY
+from flock_follower.messages import STATE
+from flock_follower.messages.command_writer import TRAJECTORY
+from flock_follower.messages.state_writer import ODOMETRY
 
 #: The nodes that a flight needs.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')

@@ -14,7 +14,7 @@
 
 """Thin rclpy nodes: parameters, topics, diagnostics; no mathematics."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import contextlib
 import os
 import signal
@@ -26,7 +26,8 @@ from flock_follower.signals import AS_A_PROGRAM, ending, hang_up_as_terminate
 SHUTDOWN_TIMEOUT = 1.8
 
 _shut_down: Callable[[], object] | None = None
-_no_exit_deadline = False
+without_deadline = False
+"""Whether the process may need a long time to finish its files, see ``exit_deadline``."""
 
 
 def on_signal(shut_down: Callable[[], object]) -> None:
@@ -42,19 +43,8 @@ def set_deadline() -> None:
     About once in some thousand shutdowns Fast DDS loops for ever while it destroys a node, and
     holds the GIL: neither a thread nor a Python handler can end the process then.
     """
-    if AS_A_PROGRAM and not _no_exit_deadline and not signal.getitimer(signal.ITIMER_REAL)[0]:
+    if AS_A_PROGRAM and not without_deadline and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
-
-
-@contextlib.contextmanager
-def no_exit_deadline() -> Iterator[None]:
-    """Set no deadline inside the block: it may need a long time to finish its files."""
-    global _no_exit_deadline
-    _no_exit_deadline = True
-    try:
-        yield
-    finally:
-        _no_exit_deadline = False
 
 
 def ignore_signals() -> None:

@@ -44,12 +44,11 @@ from flock_follower.bags.message_types import empty
 from flock_follower.bags.parameter_table import BLACK_BOX as SPECS
 from flock_follower.bags.parameter_table import recordings_folder
 from flock_follower.bags.recording import FlightRecording
-from flock_follower.files import resource
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.messages.topic_names import COMPRESSED, full_name, IMAGE, INFO, OURS, TYPES
-from flock_follower.nodes import no_exit_deadline
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
+from flock_follower.nodes.support.exit_deadline import no_exit_deadline
 from flock_follower.nodes.support.image_middleware import (
     avoid_shared_memory_for_images,
     receive_buffer_max,
@@ -61,7 +60,9 @@ from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, LONGEST_WAIT, Waiting
 from flock_follower.parameters.cameras import cameras
 from flock_follower.parameters.files import FLOWN
-from flock_follower.perception.images import decode_image, encode_jpeg
+from flock_follower.perception.encoding import encode_jpeg
+from flock_follower.perception.images import decode_image
+from flock_follower.system.files import resource
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
 WRITE_PERIOD = 0.3  # s between writes: still less than a second if one takes long

@@ -29,16 +29,9 @@ import math
 from typing import Final
 
 from flock_follower.mavlink.connection import parse_connection
-from flock_follower.messages.bridge_state import (
-    ACTIVE,
-    ARMED,
-    BridgeState,
-    FLYING,
-    NO_AUTOPILOT,
-    parse,
-    read_flag,
-    READY,
-)
+from flock_follower.messages.bridge_diagnostics import ARMED, FLYING, read_flag
+from flock_follower.messages.bridge_reading import BridgeState, parse
+from flock_follower.messages.bridge_state import ACTIVE, NO_AUTOPILOT, READY
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.

@@ -32,7 +32,9 @@ from rclpy.qos import QoSProfile
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import checked_name
-from flock_follower.messages import from_odometry, from_state, OdometryState
+from flock_follower.messages import OdometryState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import from_state
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry

@@ -49,7 +49,6 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.fast_dds import opened_segment_names
 from flock_follower.gate.flight_end import CommandSources, EndParams
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Phase
@@ -64,7 +63,7 @@ from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.status_texts import DISTANCE_PERIOD
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import OdometryState, stamp_age
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import internal_error, STEADY
 from flock_follower.nodes.support.even_clock import EvenClock
@@ -75,6 +74,7 @@ from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import filled
+from flock_follower.system.fast_dds import opened_segment_names
 
 # Not only the newest: otherwise a second commanding node would not be detected.
 COMMANDS_QOS = best_effort(10)

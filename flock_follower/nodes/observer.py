@@ -42,9 +42,9 @@ from flock_follower.checks.observations import Machine, Observations, TopicEnd, 
 from flock_follower.checks.processor import Load, LOAD_PERIOD, LoadMeter
 from flock_follower.checks.reach import find_reach, Reach
 from flock_follower.checks.single_camera import select_camera
-from flock_follower.files import resource
-from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.messages.poses import POSE_TYPES
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
@@ -68,6 +68,7 @@ from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.neighbors_file import NeighborConfig
 from flock_follower.parameters.spec import CAMERAS
 from flock_follower.perception.markers import load
+from flock_follower.system.files import resource
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics

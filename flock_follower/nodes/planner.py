@@ -46,16 +46,13 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.messages import (
-    from_odometry,
-    MOTION_TOPIC,
-    OdometryState,
-    stamp_to_nanoseconds,
-)
+from flock_follower.messages import MOTION_TOPIC, OdometryState, stamp_to_nanoseconds
 from flock_follower.messages.accelerations import from_acceleration
-from flock_follower.messages.bridge_state import ARMED_AT_TOPIC, BridgeState
+from flock_follower.messages.bridge_reading import BridgeState
+from flock_follower.messages.bridge_state import ARMED_AT_TOPIC
 from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
-from flock_follower.messages.commands import trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.even_clock import EvenClock

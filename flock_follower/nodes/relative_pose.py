@@ -44,14 +44,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
 
-from flock_follower.messages import (
-    DUPLICATE,
-    from_odometry,
-    MOTION_TOPIC,
-    NANOSECONDS,
-    OdometryState,
-    read_stamp,
-)
+from flock_follower.messages import DUPLICATE, MOTION_TOPIC, NANOSECONDS, OdometryState, read_stamp
 from flock_follower.messages.poses import (
     child_frame,
     from_range,
@@ -59,6 +52,7 @@ from flock_follower.messages.poses import (
     TRANSFORMS,
     transforms,
 )
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes.support.conversions import make, message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry

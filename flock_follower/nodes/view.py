@@ -42,16 +42,11 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.geometry import Transform
-from flock_follower.messages import (
-    from_odometry,
-    MOTION_TOPIC,
-    NANOSECONDS,
-    ODOMETRY,
-    OdometryState,
-    stamp_to_nanoseconds,
-)
+from flock_follower.messages import MOTION_TOPIC, NANOSECONDS, OdometryState, stamp_to_nanoseconds
 from flock_follower.messages.bridge_state import TOPIC as BRIDGE_TOPIC
-from flock_follower.messages.commands import from_trajectory
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,

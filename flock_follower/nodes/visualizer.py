@@ -35,14 +35,10 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
-from flock_follower.messages import (
-    from_odometry,
-    NANOSECONDS,
-    OdometryState,
-    set_quaternion,
-    set_vector,
-)
-from flock_follower.messages.commands import Command, from_trajectory
+from flock_follower.messages import NANOSECONDS, OdometryState, set_quaternion, set_vector
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.commands import Command
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.process import run

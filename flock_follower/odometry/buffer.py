@@ -38,9 +38,9 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
     rotation_vector_to_quaternion,
-    slerp,
     Transform,
 )
+from flock_follower.geometry.rotation_vectors import slerp
 from flock_follower.messages import FASTEST, MAX_JUMP, OdometryState
 
 #: Columns of a row, after the stamp.

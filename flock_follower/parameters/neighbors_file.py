@@ -70,9 +70,9 @@ from typing import Any, Final
 
 import yaml
 
-from flock_follower.files import read_text
 from flock_follower.geometry import quaternion_from_rpy, Transform
 from flock_follower.ranges import check_topic, Range, suggestion, WORDS
+from flock_follower.system.files import read_text
 
 #: Number of markers of OpenCV's dictionaries: ids run from 0 to one less.
 DICTIONARY_SIZES: Final[Mapping[str, int]] = {

@@ -32,9 +32,9 @@ from typing import Any, Final
 
 import yaml
 
-from flock_follower.files import read_text
 from flock_follower.parameters.flight_names import FLIGHT_NAMES
 from flock_follower.parameters.spec import expanded, expanded_names, refuse_unknown, Spec
+from flock_follower.system.files import read_text
 
 #: Key of a node's diagnostics: its parameter files.
 PARAMETER_FILES: Final = 'parameter_files'

@@ -254,18 +254,6 @@ def _narrowed(pixels: Any) -> GrayImage:
     return np.minimum(pixels >> shift, 255).astype(np.uint8)
 
 
-def encode_jpeg(image: GrayImage, quality: int) -> bytes:
-    """
-    Return a (height, width) uint8 image as a JPEG file of a quality from 0 to 100.
-
-    :raises ValueError: if OpenCV cannot encode it.
-    """
-    done, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not done:
-        raise ValueError(f'image of {image.shape[1]}x{image.shape[0]} px: cannot be encoded')
-    return bytes(data)
-
-
 def draw_line(canvas: Any, pixels: Array, color: Any) -> None:
     """Draw a line through pixels (n, 2), unless a point is NaN or far outside."""
     if (np.abs(pixels) < FARTHEST_PIXEL).all():

@@ -27,7 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
 from flock_follower.perception.edges import apply_step
 
 #: Error of an expected attitude, rad (1 sigma).

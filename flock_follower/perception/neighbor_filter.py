@@ -34,7 +34,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
+from flock_follower.geometry import Array, skew, Transform
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
 from flock_follower.messages import MAX_JUMP
 from flock_follower.perception.innovation import (
     AlikeErrors,

@@ -37,10 +37,10 @@ from flock_follower.geometry import (
     Array,
     canonical_quaternion,
     matrix_to_quaternion,
-    rotation_vector_to_matrix,
     skew,
     Transform,
 )
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages import FASTEST
 from flock_follower.ranges import Checked, parameter, Range
 

@@ -20,7 +20,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from flock_follower.files import resource
 from flock_follower.geometry import Transform
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.cameras import (
@@ -39,6 +38,7 @@ from flock_follower.perception.range_tracking import RangingParams
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.ranges import MAX_OFFSET, Range
+from flock_follower.system.files import resource
 
 #: Of a neighbor as seen from a camera in a hand: the rotation of the camera moves it sideways.
 HAND_ACCELERATION = 4.0  # m/s^2

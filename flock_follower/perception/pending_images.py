@@ -27,9 +27,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_follower.messages import DUPLICATE, Make, odometry, OdometryState
-from flock_follower.messages.accelerations import acceleration
-from flock_follower.messages.poses import pose_topic, pose_with_covariance, PoseState, RangeState
+from flock_follower.messages import DUPLICATE, Make, OdometryState
+from flock_follower.messages.poses import (
+    acceleration,
+    pose_topic,
+    pose_with_covariance,
+    PoseState,
+    RangeState,
+)
+from flock_follower.messages.state_writer import odometry
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.perception.camera import CameraModel

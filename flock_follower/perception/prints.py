@@ -30,7 +30,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, rpy_from_matrix, Transform
+from flock_follower.geometry import Array, rpy_from_matrix, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.parameters.neighbors_file import Marker
 from flock_follower.perception.images import gray_levels, GrayImage
 from flock_follower.perception.markers import marker_code

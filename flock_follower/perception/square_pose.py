@@ -26,7 +26,8 @@ import math
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
+from flock_follower.geometry import Array, skew, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import apply_step, cross, solve_normal
 from flock_follower.perception.markers import marker_corners

@@ -25,13 +25,8 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.messages import FUTURE_TOLERANCE, OdometryState, RELATIVE
 from flock_follower.messages.accelerations import AccelerationState, with_acceleration
-from flock_follower.messages.bridge_state import (
-    ACTIVE,
-    BridgeState,
-    effective_state,
-    parse,
-    TAKEN_OVER,
-)
+from flock_follower.messages.bridge_reading import BridgeState, effective_state, parse
+from flock_follower.messages.bridge_state import ACTIVE, TAKEN_OVER
 from flock_follower.messages.commands import Command
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.planner.inputs import Neighbor, OwnState, propagate

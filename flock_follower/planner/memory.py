@@ -28,7 +28,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.messages import FUTURE_TOLERANCE, jump, ODOMETRY_JUMP
+from flock_follower.messages import FUTURE_TOLERANCE
+from flock_follower.messages.jumps import jump, ODOMETRY_JUMP
 from flock_follower.planner.inputs import (
     distance_known,
     implausible,

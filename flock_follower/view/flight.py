@@ -30,7 +30,7 @@ import numpy as np
 
 from flock_follower.geometry import quaternion_to_matrix, Transform
 from flock_follower.messages import OdometryState
-from flock_follower.messages.bridge_state import BridgeState, effective_state, parse, SILENCE_MAX
+from flock_follower.messages.bridge_reading import BridgeState, effective_state, parse, SILENCE_MAX
 from flock_follower.messages.commands import Command
 from flock_follower.odometry.choice import OdometryChoice
 from flock_follower.view.scene import (

@@ -24,12 +24,8 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import (
-    draw_line,
-    encode_jpeg,
-    FARTHEST_PIXEL,
-    GrayImage,
-)
+from flock_follower.perception.encoding import encode_jpeg
+from flock_follower.perception.images import draw_line, FARTHEST_PIXEL, GrayImage
 from flock_follower.view.flight import shadow
 from flock_follower.view.scene import ARROW, BOX, COLORS, ELLIPSOID, LINE, Shape, TEXT
 

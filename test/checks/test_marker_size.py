@@ -21,7 +21,8 @@ from observed import attitude, CAMERA, LEADER, position
 import pytest
 
 from flock_follower.checks.marker_size import distance_ratio, Ratio
-from flock_follower.geometry import Array, quaternion_to_matrix, rotation_vector_to_matrix
+from flock_follower.geometry import Array, quaternion_to_matrix
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 
 TIMES = np.arange(0.0, 5.0, 0.1)
 R = np.array([quaternion_to_matrix(attitude(t)) for t in TIMES])

@@ -28,8 +28,9 @@ from flock_follower.checks.findings import ERROR, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
 from flock_follower.checks.pose_topics import check_poses
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
-from flock_follower.messages import odometry, to_nanoseconds
+from flock_follower.messages import to_nanoseconds
 from flock_follower.messages.poses import POSE, pose_with_covariance
+from flock_follower.messages.state_writer import odometry
 from flock_follower.messages.topic_names import names_there
 from flock_follower.parameters.neighbors_file import parse
 from flock_follower.perception.pose_sources import NO_ATTITUDE, UNKNOWN_FRAME, UNPLACED

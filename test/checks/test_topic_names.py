@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import pytest
 
-from flock_follower.messages import ODOMETRY
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import (
     COMPRESSED,
     full_name,

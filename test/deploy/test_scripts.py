@@ -22,7 +22,7 @@ import subprocess
 
 import pytest
 
-from flock_follower.fast_dds import PROFILE_VARIABLES
+from flock_follower.system.fast_dds import PROFILE_VARIABLES
 
 DEPLOY = Path(__file__).resolve().parents[2] / 'deploy'
 

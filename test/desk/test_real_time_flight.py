@@ -44,13 +44,13 @@ from flock_desk.scenarios.scenario import (
 )
 from flock_desk.sensors.vio import Odometry
 from flock_follower.geometry import (
-    matrix_to_rotation_vector,
     quaternion_from_yaw,
     quaternion_to_matrix,
     Transform,
     yaw_from_quaternion,
 )
-from flock_follower.ned import enu_to_ned, yaw_enu_to_ned
+from flock_follower.geometry.rotation_vectors import matrix_to_rotation_vector
+from flock_follower.mavlink.ned import enu_to_ned, yaw_enu_to_ned
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
 

@@ -28,7 +28,8 @@ from flock_desk.camera.renderer import (
     Sensor,
     T_BODY_MARKER,
 )
-from flock_follower.geometry import R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import R_FLU_OPTICAL, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
 

@@ -30,7 +30,9 @@ from flock_follower.flock.alignment import Frame
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.sender import Sender
 from flock_follower.geometry import quaternion_from_yaw
-from flock_follower.messages import from_odometry, odometry, OdometryState
+from flock_follower.messages import OdometryState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 
 MS = 1_000_000
 

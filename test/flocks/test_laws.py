@@ -28,7 +28,8 @@ from flock_desk.flocks.agents import simulate_graph
 from flock_desk.flocks.paper import FLIGHT_PARAMS, LEADERLESS_START, PAPER_PARAMS, random_start
 from flock_follower import flocking
 from flock_follower.flock.neighbor_graph import graph_law
-from flock_follower.geometry import Array, rotation_vector_to_matrix
+from flock_follower.geometry import Array
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 
 ALL = np.array([(0, 1), (0, 2), (1, 2)])
 NONE = np.empty((0, 2), dtype=np.int64)

@@ -21,7 +21,6 @@ from bridge_flight import Flight
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.files import resource
 from flock_follower.mavlink.dialects import ARDUPILOT, DIALECTS, PX4, Version
 from flock_follower.mavlink.parameter_check import (
     obstacle,
@@ -30,6 +29,7 @@ from flock_follower.mavlink.parameter_check import (
     read_recommendations,
     Recommendation,
 )
+from flock_follower.system.files import resource
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 A, B, C = (Recommendation(name, value, f'why {name}') for name, value in (

@@ -42,8 +42,9 @@ from flock_follower.mavlink.commands import Outcome
 from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.messages import to_array
-from flock_follower.messages.bridge_state import REFUSED
-from flock_follower.messages.commands import Command, trajectory
+from flock_follower.messages.bridge_diagnostics import REFUSED
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.sole_publisher import SEVERAL

@@ -28,9 +28,9 @@ import rclpy
 from rclpy.node import Node
 
 from flock_desk.program import NODES, PROGRAMS
-from flock_follower.files import resource
 from flock_follower.nodes.support import process
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.system.files import resource
 
 BRIDGE = 'connection:=udpin:127.0.0.1:0'
 SAMPLE = str(resource('bags/sample'))

@@ -22,14 +22,14 @@ from unittest import mock
 import pytest
 
 from flock_follower.checks.reach import Reach
-from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables
-from flock_follower.files import resource
 from flock_follower.nodes import mavlink_bridge, planner
 from flock_follower.nodes.support.image_middleware import (
     avoid_shared_memory_for_images,
     IMAGES_BUFFER,
 )
 from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.system.fast_dds import PROFILE_VARIABLES, profile_variables
+from flock_follower.system.files import resource
 
 KILTED, JAZZY = PROFILE_VARIABLES
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'

@@ -22,10 +22,10 @@ from unittest import mock
 import pytest
 import rclpy
 
-from flock_follower.flight_parameters import TABLE
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.parameters.sections import files_in
 
 OWN = 'planner:\n  ros__parameters:\n    v_max: 0.9\n'

@@ -34,6 +34,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.support import even_clock
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 from flock_follower.nodes.support.sole_publisher import SEVERAL
 from flock_follower.parameters.sections import PARAMETER_FILES
@@ -248,10 +249,10 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
     rig = Driven(Planner(parameter_overrides=overrides(require_bridge=False)))
     commands: list[MultiDOFJointTrajectory] = rig.sent['command/trajectory']
     elapsed, shift = 0.0, 0.0
-    monkeypatch.setattr(rig.node, 'read_clocks', lambda: (
+    monkeypatch.setattr(even_clock, 'read_clocks', lambda _: (
         START + round((elapsed + shift) * 1e9), 100.0 + elapsed))
     monkeypatch.setattr(rig.node, 'get_clock', lambda: SimpleNamespace(
-        now=lambda: SimpleNamespace(nanoseconds=rig.node.read_clocks()[0])))
+        now=lambda: SimpleNamespace(nanoseconds=even_clock.read_clocks(rig.node)[0])))
     rig.give('camera_info', CameraInfo(width=640, height=480, k=CAMERA))
     rig.call('engage', data=True)
     for tick in range(104):
@@ -259,7 +260,7 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         stamps = [START + round((elapsed + shift - age) * 1e9) for age in (0.01, 0.06)]
         if tick == 50:
             shift = step  # what comes now was stamped before
-        arrival = rig.node.read_clocks()[0]
+        arrival = even_clock.read_clocks(rig.node)[0]
         rig.node._even_clock.now()
         for topic, stamp, child, place in (('odom', stamps[0], 'base_link', (0.0, 0.0, 2.0)),
                                            ('neighbors', stamps[1], 'leader', AHEAD)):

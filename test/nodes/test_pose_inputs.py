@@ -29,8 +29,8 @@ import pytest
 from sensor_msgs.msg import CameraInfo
 from test_relative_pose_node import AHEAD, calibration, LEADER, Rig, VELOCITY
 
-from flock_follower.messages import from_odometry
 from flock_follower.messages.poses import pose_with_covariance
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.pose_inputs import INVALID_FRAME

@@ -43,11 +43,12 @@ from flock_desk import recorder_node
 from flock_desk.runs.processes import wait_until
 from flock_follower import nodes
 from flock_follower.bags.bag import BagError, deserialize, open_bag
-from flock_follower.flight_parameters import TABLE
 from flock_follower.messages import NANOSECONDS
 from flock_follower.nodes import black_box
+from flock_follower.nodes.support.exit_deadline import no_exit_deadline
 from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.parameters.files import parameters_flown
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.images import decode_compressed
 
 PIXELS = (np.add.outer(np.arange(480), np.arange(640)) // 5 % 256).astype(np.uint8)
@@ -219,7 +220,7 @@ def test_no_deadline_ends_a_process_that_finishes_its_files(
     deadlines: list[float] = []
     monkeypatch.setattr(nodes, 'AS_A_PROGRAM', True)
     monkeypatch.setattr(signal, 'setitimer', lambda _, seconds: deadlines.append(seconds))
-    with nodes.no_exit_deadline():
+    with no_exit_deadline():
         nodes.set_deadline()
     assert deadlines == []
     nodes.set_deadline()

@@ -37,7 +37,6 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import (
-    from_odometry,
     MOTION_TOPIC,
     RELATIVE,
     set_quaternion,
@@ -45,6 +44,7 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.messages.poses import from_pose
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose

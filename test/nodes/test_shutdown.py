@@ -29,7 +29,7 @@ from flock_desk.runs.processes import (
     Processes,
     wait_until,
 )
-from flock_follower.files import resource
+from flock_follower.system.files import resource
 
 MOMENTS = (0.8, 2.5)  # s: during the imports or at the start, and in flight
 WRITER = """

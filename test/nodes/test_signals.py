@@ -37,8 +37,8 @@ from flock_desk.program import NODES as ALL_NODES
 from flock_desk.program import PROGRAMS
 from flock_desk.runs.processes import free_udp_port, private_environment, Processes, wait_until
 from flock_follower import signals
-from flock_follower.files import resource
 from flock_follower.nodes.support.process import unwritable_logs
+from flock_follower.system.files import resource
 
 pytestmark = pytest.mark.usefixtures('default_hangup')
 #: Instead of the library that a program imports first: sends it a signal, and waits for the end.

@@ -34,11 +34,12 @@ from sensor_msgs.msg import BatteryState, CameraInfo, CompressedImage, Image, Ra
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from flock_follower.fast_dds import PROFILE_VARIABLES
 from flock_follower.geometry import IDENTITY_QUATERNION, Transform
-from flock_follower.messages.commands import Command, trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.view import IDLE_PERIOD, PERIOD, View
+from flock_follower.system.fast_dds import PROFILE_VARIABLES
 
 STAMP = 1_700_000_000 * 10**9
 STILL = (0.0, 0.0, 0.0)

@@ -30,7 +30,8 @@ from visualization_msgs.msg import Marker
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_to_matrix
 from flock_follower.messages import to_array
-from flock_follower.messages.commands import Command, trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.visualizer import Visualizer
 from flock_follower.view.scene import (

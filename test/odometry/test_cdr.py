@@ -23,7 +23,8 @@ import pytest
 
 from flock_follower.bags.message_types import empty, typestore
 from flock_follower.geometry import IDENTITY_QUATERNION
-from flock_follower.messages import from_odometry, ODOMETRY, odometry
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY, odometry
 from flock_follower.odometry.reader import read_odometry
 
 STAMP = 1_700_000_000_123_456_789  # ns

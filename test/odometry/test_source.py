@@ -33,7 +33,8 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
-from flock_follower.messages import odometry, OdometryState, set_quaternion, set_vector
+from flock_follower.messages import OdometryState, set_quaternion, set_vector
+from flock_follower.messages.state_writer import odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.odometry.static_frames import StaticFrames
 

@@ -23,14 +23,14 @@ from typing import Any
 import pytest
 import yaml
 
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters import neighbors_file
 from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.parameters.sections import files_in, ignored_sections, names_for_any_node
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import Member, RADIUS, ROLES
+from flock_follower.system.files import resource
 
 
 def of(node: str, **values: Any) -> dict[str, Any]:

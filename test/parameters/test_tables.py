@@ -23,16 +23,16 @@ from typing import Any
 import pytest
 
 from flock_follower.bags.parameter_table import BLACK_BOX, recordings_folder
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
 from flock_follower.parameters.cameras import cameras
 from flock_follower.parameters.files import parse_parameters, read_parameters
 from flock_follower.parameters.flight_names import FLIGHT_NAMES
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.planner.parameter_table import planner_params
+from flock_follower.system.files import resource
 
 BUILT = {'relative_pose': tracker, 'planner': planner_params}
 

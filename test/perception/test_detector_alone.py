@@ -24,11 +24,12 @@ import numpy as np
 import pytest
 
 from flock_follower.bags.message_types import empty
-from flock_follower.flight_parameters import TABLE
 from flock_follower.geometry import quaternion_from_rpy, quaternion_from_yaw, Transform
-from flock_follower.messages import from_odometry, to_nanoseconds
+from flock_follower.messages import to_nanoseconds
 from flock_follower.messages.poses import from_pose
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.parameters.files import check_values
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import Perceiver

@@ -25,8 +25,9 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import quaternion_from_rpy, Transform
-from flock_follower.messages import from_odometry, odometry
 from flock_follower.messages.poses import from_pose, pose_with_covariance, transforms
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 from flock_follower.odometry.buffer import OdometrySample
 
 JUDGE = Path(__file__).resolve().parents[2] / 'benchmarks' / 'poses.py'

@@ -23,11 +23,10 @@ import numpy as np
 import pytest
 from warped_marker import WarpedMarker
 
-from flock_follower.geometry import (
-    Array,
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import (
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
-    Transform,
 )
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import Measurement

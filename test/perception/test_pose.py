@@ -37,11 +37,10 @@ from marker_images import (
 import numpy as np
 import pytest
 
-from flock_follower.geometry import (
-    Array,
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import (
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
-    Transform,
 )
 from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception import pose as pose_module

@@ -25,8 +25,10 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_from_yaw, Transform
-from flock_follower.messages import from_odometry, odometry, to_nanoseconds
+from flock_follower.messages import to_nanoseconds
 from flock_follower.messages.poses import from_pose, pose_with_covariance, PoseState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 from flock_follower.parameters.neighbors_file import NeighborConfig, parse, PoseSource
 from flock_follower.perception import pose_sources
 from flock_follower.perception.pending_images import Perceiver

@@ -26,7 +26,8 @@ import pytest
 
 from flock_follower.checks.collector import Collector, INVERTED, MIRRORED
 from flock_follower.checks.observations import Observations, Picture
-from flock_follower.geometry import rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception import prints
 from flock_follower.perception.look import Sighting

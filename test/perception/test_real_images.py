@@ -27,10 +27,10 @@ import numpy as np
 import pytest
 import yaml
 
-from flock_follower.geometry import (
+from flock_follower.geometry import Transform
+from flock_follower.geometry.rotation_vectors import (
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
-    Transform,
 )
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import markers as aruco

@@ -24,12 +24,8 @@ from marker_images import CONFIG, make_camera, render, TAIL
 import numpy as np
 import pytest
 
-from flock_follower.geometry import (
-    Array,
-    rotation_vector_to_matrix,
-    rotation_vector_to_quaternion,
-    Transform,
-)
+from flock_follower.geometry import Array, rotation_vector_to_quaternion, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import row_delay

@@ -23,11 +23,10 @@ from marker_images import DICTIONARY, facing, known, make_camera, marker_code, r
 import numpy as np
 import pytest
 
-from flock_follower.geometry import (
-    Array,
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import (
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
-    Transform,
 )
 from flock_follower.parameters.neighbors_file import Marker
 from flock_follower.perception.images import GrayImage

@@ -22,13 +22,10 @@ from marker_images import CONFIG, DICTIONARY, Hovering, make_camera, render, SID
 import numpy as np
 import pytest
 
-from flock_follower.geometry import (
-    Array,
+from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, Transform
+from flock_follower.geometry.rotation_vectors import (
     matrix_to_rotation_vector,
-    quaternion_from_rpy,
-    quaternion_to_matrix,
     rotation_vector_to_matrix,
-    Transform,
 )
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.parameters.neighbors_file import MarkedNeighbor, Marker, NeighborConfig

@@ -26,10 +26,10 @@ from rewritten_odometry import rewritten_bag, Source, sources
 
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
 from flock_desk.runs.summary import evaluation_figures
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.planner.modes import State
+from flock_follower.system.files import resource
 
 ATTITUDE_NOISE = np.radians(0.3)
 

@@ -37,15 +37,17 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.flight_parameters import TABLE
 from flock_follower.gate.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
-from flock_follower.messages import from_odometry
-from flock_follower.messages.commands import Command, from_trajectory, trajectory
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.parameters.files import parse_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
 PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage,

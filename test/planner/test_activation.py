@@ -25,18 +25,12 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
-from flock_follower.messages import from_odometry, odometry, OdometryState
-from flock_follower.messages.bridge_state import (
-    ACTIVE,
-    BRIDGE_STATES,
-    BridgeState,
-    effective_state,
-    INACTIVE,
-    NO_AUTOPILOT,
-    parse,
-    SILENCE_MAX,
-)
+from flock_follower.messages import OdometryState
+from flock_follower.messages.bridge_reading import BridgeState, effective_state, parse, SILENCE_MAX
+from flock_follower.messages.bridge_state import ACTIVE, BRIDGE_STATES, INACTIVE, NO_AUTOPILOT
 from flock_follower.messages.commands import Command
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import odometry
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory, NONE
 from flock_follower.planner.modes import State

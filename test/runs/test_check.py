@@ -30,7 +30,7 @@ from flock_follower import check
 from flock_follower.bags.mcap_file import MARK
 from flock_follower.check import main, newest_recording
 from flock_follower.checks.observations import NodeStatus, Observations
-from flock_follower.files import resource
+from flock_follower.system.files import resource
 
 pytestmark = pytest.mark.slow
 SAMPLE = resource('bags/sample')

@@ -29,7 +29,7 @@ import pytest
 
 from flock_desk.program import PROGRAMS
 from flock_desk.runs.processes import claim_domain, free_udp_port, private_environment, Processes
-from flock_follower.fast_dds import PROFILE_VARIABLES
+from flock_follower.system.fast_dds import PROFILE_VARIABLES
 
 pytestmark = pytest.mark.ros
 #: What a busy machine makes late is no false alarm.

@@ -22,7 +22,8 @@ import pytest
 from flock_desk.runs.decoding import decoded_ahead, IMAGES_AHEAD
 from flock_follower.bags.bag import BagMessage, serialize
 from flock_follower.bags.message_types import empty
-from flock_follower.perception.images import decode_image, encode_jpeg
+from flock_follower.perception.encoding import encode_jpeg
+from flock_follower.perception.images import decode_image
 
 IMAGE = 'sensor_msgs/msg/CompressedImage'
 

@@ -33,10 +33,10 @@ from flock_desk.runs.summary import evaluation_figures, replay_figures
 from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
 from flock_follower.bags.writer import BagWriter
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
 from flock_follower.messages import NANOSECONDS
 from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
+from flock_follower.system.files import resource
 
 pytestmark = pytest.mark.slow
 

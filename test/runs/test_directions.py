@@ -18,7 +18,8 @@ import pytest
 
 from flock_desk.runs.directions import opposed
 from flock_follower.bags.message_types import empty
-from flock_follower.messages.commands import Command, trajectory
+from flock_follower.messages.command_writer import trajectory
+from flock_follower.messages.commands import Command
 
 EAST = np.array([1.0, 0.0, 0.0])
 

@@ -35,11 +35,12 @@ from flock_follower.bags.bag import BagError, BagMessage, deserialize, open_bag,
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.recorded_system import check_bag
-from flock_follower.files import resource
-from flock_follower.flight_parameters import TABLE
-from flock_follower.messages import from_odometry, ODOMETRY
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.messages.topic_names import IMAGE, RANGE
 from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.flight_parameters import TABLE
+from flock_follower.system.files import resource
 
 pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')

@@ -29,11 +29,11 @@ import pytest
 import yaml
 
 from flock_desk.marker import APRILTAG_NOTE, Box, draw, layout, main, Page, PAGES
-from flock_follower.files import resource
 from flock_follower.geometry import Array
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import detect, dictionary_size, marker_cells
+from flock_follower.system.files import resource
 
 POINT = 25.4 / 72.0  # mm
 CORNER = r'(-?[\d.]+) (-?[\d.]+) [ml]'

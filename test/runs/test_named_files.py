@@ -23,7 +23,7 @@ from pathlib import Path
 import pytest
 
 from flock_desk.program import PROGRAMS
-from flock_follower.files import resource
+from flock_follower.system.files import resource
 
 SAMPLE = str(resource('bags/sample'))
 

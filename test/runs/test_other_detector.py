@@ -29,11 +29,12 @@ from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import ERROR, OK, WARNING
 from flock_follower.checks.recorded_system import check_bag
-from flock_follower.flight_parameters import TABLE
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.messages import from_odometry
+from flock_follower.geometry import Array, Transform
+from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages.poses import POSE, pose_with_covariance
+from flock_follower.messages.state_reader import from_odometry
 from flock_follower.parameters.files import parse_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.tracker import camera_mounting
 

@@ -25,9 +25,9 @@ import pytest
 from flock_desk.follower import Follower
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
 from flock_follower.bags.bag import BagMessage
-from flock_follower.flight_parameters import TABLE
 from flock_follower.messages import OdometryState
 from flock_follower.parameters.files import parse_parameters
+from flock_follower.parameters.flight_parameters import TABLE
 
 IMAGE, ODOM = '/image_raw/compressed', '/odom'
 

@@ -21,8 +21,8 @@ import pytest
 
 from flock_desk import sample_bag as sample
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.files import resource
 from flock_follower.perception.markers import detect
+from flock_follower.system.files import resource
 
 pytestmark = pytest.mark.slow
 TOPICS = {'/image_raw/compressed': 360, '/camera_info': 360, '/odom': 2401,

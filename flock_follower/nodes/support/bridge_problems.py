@@ -32,7 +32,7 @@ from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
-from flock_follower.messages.bridge_state import (
+from flock_follower.messages.bridge_diagnostics import (
     ARMED,
     FLYING,
     LINK_FAULT,

@@ -41,19 +41,19 @@ from flock_follower.mavlink.status_texts import WARNING
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     bridge_state,
-    from_state,
     FUTURE_TOLERANCE,
-    jump,
     MOTION_TOPIC,
     NANOSECONDS,
-    ODOMETRY_JUMP,
     OdometryState,
     set_vector,
     to_nanoseconds,
 )
+from flock_follower.messages.jumps import jump, ODOMETRY_JUMP
+from flock_follower.messages.state_writer import from_state
 from flock_follower.nodes.support.bridge_problems import BridgeProblems
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import Problem
+from flock_follower.nodes.support.even_clock import read_clocks
 from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
@@ -195,7 +195,7 @@ class BridgeReport:
 
     def _odometry_message(self, state: OdometryState, valid: float) -> Any:
         """Return the message of a state that was valid at a time, s, on the monotonic clock."""
-        system, monotonic = self._node.read_clocks()
+        system, monotonic = read_clocks(self._node)
         waited = max(0, to_nanoseconds(monotonic - valid))
         return from_state(make, state._replace(stamp=max(0, system - waited)))
 

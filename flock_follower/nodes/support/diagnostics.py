@@ -34,7 +34,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 
-from flock_follower.fast_dds import opened_segment_names, undelivered
+from flock_follower.system.fast_dds import opened_segment_names, undelivered
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN

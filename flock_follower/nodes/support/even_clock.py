@@ -16,8 +16,14 @@
 
 from __future__ import annotations
 
+import time
+
+from rclpy.node import Node
+
 from flock_follower.nodes.support.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.nodes.support.runtime import FlockNode
+
+READING_TIME = 1e-3  # s within which two clocks are read
 
 
 class EvenClock(ClockWatch):
@@ -37,7 +43,7 @@ class EvenClock(ClockWatch):
         """Return the time, ns; find a step of the system clock, and count it."""
         if self.simulated:
             return int(self._node.get_clock().now().nanoseconds)
-        system, monotonic = self._node.read_clocks()
+        system, monotonic = read_clocks(self._node)
         if step := self.take(system, monotonic):
             self._node.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
         return system - self.clock_shift
@@ -52,3 +58,14 @@ class EvenClock(ClockWatch):
         if not fresh:
             self._node.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
         return fresh
+
+
+def read_clocks(node: Node) -> tuple[int, float]:
+    """Return a node's clock, ns, and the monotonic one, s, read at the same time."""
+    for _ in range(3):  # a pause between two readings would look like a clock that was set
+        before = time.monotonic()
+        system: int = node.get_clock().now().nanoseconds
+        after = time.monotonic()
+        if after - before < READING_TIME:
+            break
+    return system, 0.5 * (before + after)

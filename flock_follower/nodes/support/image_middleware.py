@@ -20,8 +20,8 @@ from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Final
 
-from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables
 from flock_follower.nodes.support.middleware import avoid_shared_memory, UDP_PROFILE
+from flock_follower.system.fast_dds import PROFILE_VARIABLES, profile_variables
 
 #: With a receive buffer for images: for ROS on this computer alone, and otherwise.
 _UDP_IMAGES_PROFILE = 'config/dds/fastdds_udp_images.xml'

@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections.abc import MutableMapping
 from pathlib import Path
 
-from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables
-from flock_follower.files import resource
+from flock_follower.system.fast_dds import PROFILE_VARIABLES, profile_variables
+from flock_follower.system.files import resource
 
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'

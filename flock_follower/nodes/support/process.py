@@ -32,11 +32,11 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 
-from flock_follower.files import read_text
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.parameters import usage
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.sections import files_in
+from flock_follower.system.files import read_text
 
 LOGGER = 'flock_follower'  # of lines before a node has its name
 _GENERATOR = 'rosidl_generator_py.generate_py_impl'

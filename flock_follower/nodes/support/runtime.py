@@ -53,7 +53,6 @@ READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 #: Bytes of the largest small message. rclpy takes 13 s to deserialize one of 17 MB, and no other
 #: thread of the process runs meanwhile.
 SMALL_MESSAGE = 4096
-READING_TIME = 1e-3  # s within which two clocks are read
 LONGEST_WAIT = 1_000_000_000  # ns: every node polls more often
 
 
@@ -211,16 +210,6 @@ class FlockNode(Node):
         waited = min(max(now - received, 0), LONGEST_WAIT) if received else 0
         clock: int = self.get_clock().now().nanoseconds
         return clock - waited
-
-    def read_clocks(self) -> tuple[int, float]:
-        """Return this node's clock, ns, and the monotonic one, s, read at the same time."""
-        for _ in range(3):  # a pause between two readings would look like a clock that was set
-            before = time.monotonic()
-            system: int = self.get_clock().now().nanoseconds
-            after = time.monotonic()
-            if after - before < READING_TIME:
-                break
-        return system, 0.5 * (before + after)
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """Create a publisher as rclpy does, without QoS events."""

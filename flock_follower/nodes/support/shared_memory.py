@@ -20,7 +20,7 @@ import contextlib
 from pathlib import Path
 from typing import Final
 
-from flock_follower.fast_dds import LOCK_SUFFIX, opened_segment_names
+from flock_follower.system.fast_dds import LOCK_SUFFIX, opened_segment_names
 
 #: Share of a file of shared memory that is for messages (measured with Fast DDS 2.14 and 3.2).
 _SEGMENT_SHARE: Final = 64 / 67

@@ -30,7 +30,7 @@ def resource(relative: str) -> Path:
 
     :raises FileNotFoundError: naming every place that was searched.
     """
-    bases = [Path(__file__).resolve().parent.parent,
+    bases = [Path(__file__).resolve().parents[2],
              Path(sys.prefix) / 'share' / 'flock_follower']
     with suppress(ImportError, LookupError, OSError):  # not an ament install
         from ament_index_python.packages import get_package_share_directory

@@ -31,105 +31,39 @@ cycle, the event.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 import math
 from types import MappingProxyType
 from typing import Any, Final
 
+from flock_desk.follower.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.flock.exchange import Sharing
 from flock_follower.gate.gate import Gate
-from flock_follower.gate.setpoint_rules import NONE, Setpoint
+from flock_follower.gate.setpoint_rules import NONE
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport, ODOM
 from flock_follower.geometry import Array
 from flock_follower.messages import (
-    from_odometry,
     Make,
     NANOSECONDS,
-    ODOMETRY,
     OdometryState,
     stamp_age,
     STATE,
     to_nanoseconds,
 )
-from flock_follower.messages.accelerations import (
-    ACCELERATION,
-    from_acceleration,
-    with_acceleration,
-)
-from flock_follower.messages.commands import Command, from_trajectory, TRAJECTORY, trajectory
-from flock_follower.messages.poses import POSE, PoseState, RangeState
+from flock_follower.messages.accelerations import from_acceleration, with_acceleration
+from flock_follower.messages.command_reader import from_trajectory
+from flock_follower.messages.command_writer import TRAJECTORY, trajectory
+from flock_follower.messages.commands import Command
+from flock_follower.messages.poses import ACCELERATION, POSE, PoseState, RangeState
+from flock_follower.messages.state_reader import from_odometry
+from flock_follower.messages.state_writer import ODOMETRY
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, ODOMETRY_LAGS, Perceiver
 from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.range_tracking import Ranged
-from flock_follower.perception.tracker import Sighting
-from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.step import Decision
-
-
-@dataclass
-class ImageOutcome:
-    """
-    The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
-
-    ``sighting`` is None if the image was never processed; ``camera`` is the name of its
-    camera, '' if there is only one.
-    """
-
-    stamp: int
-    sighting: Sighting | None = None
-    decoding: float = 0.0
-    perception: float = 0.0
-    camera: str = ''
-
-
-@dataclass
-class Tick:
-    """One tick of the planner, at a time in ns, with the ego state it acted on."""
-
-    time: int
-    decision: Decision
-    own: OwnState | None
-    cpu: float
-
-
-@dataclass
-class ControlCycle:
-    """One cycle of the control, at a time in ns; nothing is sent if the kind is 'none'."""
-
-    time: int
-    setpoint: Setpoint
-    cpu: float
-
-
-class Listener:
-    """Receives the outcomes of ``Follower``, in the order of the events; each method is empty."""
-
-    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
-        """Take a message that a node would publish, at a time in ns."""
-
-    def odometry(self, state: OdometryState) -> None:
-        """Take the ego state."""
-
-    def image(self, outcome: ImageOutcome) -> None:
-        """Take the outcome of an image."""
-
-    def tick(self, tick: Tick) -> None:
-        """Take the outcome of a tick of the planner."""
-
-    def cycle(self, cycle: ControlCycle) -> None:
-        """Take the outcome of a cycle of the control."""
-
-    def send(self, time: int, messages: list[OdometryState]) -> None:
-        """Take messages to other followers, at a time in ns."""
-
-    def reject(self, reason: str, detail: str) -> None:
-        """Take the reason for which an input was dropped."""
-
 
 #: After a silence of this, ns, nothing changes any more: the rest of the silence is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS

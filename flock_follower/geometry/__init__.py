@@ -26,7 +26,8 @@ FLU        x forward, y left, z up                     bodies (``base_link``), R
 optical    x right, y down, z forward                  images, REP-103
 =========  ==========================================  ==============================
 
-The frames of MAVLink are in ``ned``.
+The frames of MAVLink are in ``mavlink.ned``; what only perception, checks and the desk need of
+rotations is in ``geometry.rotation_vectors``.
 """
 
 from __future__ import annotations
@@ -138,36 +139,15 @@ def rotation_vector_to_quaternion(vector: ArrayLike) -> Array:
 
 def quaternion_to_rotation_vector(q: ArrayLike) -> Array:
     """Return the rotation vector (axis times angle, rad), angle in [0, pi], of a quaternion."""
-    return _rotation_vector(canonical_quaternion(normalize_quaternion(q)))
+    return unit_quaternion_to_rotation_vector(canonical_quaternion(normalize_quaternion(q)))
 
 
-def _rotation_vector(q: Array) -> Array:
+def unit_quaternion_to_rotation_vector(q: Array) -> Array:
     """Return the rotation vector of a unit quaternion with w >= 0."""
     x, y, z, w = q.tolist()
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
     return np.array([scale * x, scale * y, scale * z])
-
-
-def rotation_vector_to_matrix(vector: ArrayLike) -> Array:
-    """Return the (3, 3) rotation matrix of a rotation vector (axis times angle, rad)."""
-    x, y, z = np.asarray(vector, dtype=float).tolist()
-    angle2 = x * x + y * y + z * z
-    angle = math.sqrt(angle2)
-    # Rodrigues' formula; near 0 its fractions are 1 and 1/2.
-    sine, versine = (1.0, 0.5) if angle < 1e-6 else (
-        math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle)**2)
-    xx, yy, zz = versine * x * x, versine * y * y, versine * z * z
-    xy, xz, yz = versine * x * y, versine * x * z, versine * y * z
-    sx, sy, sz = sine * x, sine * y, sine * z
-    return np.array([[1.0 - yy - zz, xy - sz, xz + sy],
-                     [xy + sz, 1.0 - xx - zz, yz - sx],
-                     [xz - sy, yz + sx, 1.0 - xx - yy]])
-
-
-def matrix_to_rotation_vector(rotation: ArrayLike) -> Array:
-    """Return the rotation vector (axis times angle, rad) of a (3, 3) rotation matrix."""
-    return _rotation_vector(matrix_to_quaternion(rotation))
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
@@ -197,13 +177,6 @@ def yaw_from_quaternion(q: ArrayLike) -> float:
     """Return the yaw, rad in [-pi, pi], of an attitude quaternion (z-y-x convention)."""
     x, y, z, w = normalize_quaternion(q).tolist()
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
-    """Return the rotation at a fraction of the shorter arc from q0 (0) to q1 (1)."""
-    delta = quaternion_multiply(quaternion_conjugate(normalize_quaternion(q0)), q1)
-    step = rotation_vector_to_quaternion(fraction * quaternion_to_rotation_vector(delta))
-    return quaternion_multiply(normalize_quaternion(q0), step)
 
 
 def skew(vector: ArrayLike) -> Array:

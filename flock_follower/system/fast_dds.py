@@ -29,7 +29,7 @@ from pathlib import Path
 import pwd
 from typing import Final
 
-from flock_follower.files import resource
+from flock_follower.system.files import resource
 
 #: Variables that name a profile. Fast DDS 3 prefers the first; Fast DDS 2 reads the second alone.
 PROFILE_VARIABLES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
