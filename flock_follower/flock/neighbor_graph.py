@@ -35,9 +35,6 @@ from flock_follower.geometry import Array
 
 HELD_FACTOR = 1.15  # factor of distance by which a third vehicle must be nearer to remove an edge
 _FADE = 0.28  # share of the band, from d0, up to which vehicles without an edge separate fully
-#: sin(pi y) / y by the powers of y^2, to 1e-13 up to y = 0.5; numpy's cosine takes twice as long.
-_SINE = (3.141592653589635, -5.167712779988027, 2.5501640359098254, -0.5992644339893498,
-         0.08214479510126743, -0.007364007062844549, 0.0004474942724849263)
 
 
 def edges(position: Array, positions: Array, radii: Array, own_radius: float,
@@ -79,31 +76,25 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     :param others: (m,) whether a neighbor is not in the flock: separation with the L of the pair.
     :param most: largest cohesion with one neighbor, m/s^2.
     """
-    r2 = (offsets ** 2).sum(axis=1, keepdims=True)
+    r2 = np.einsum('ij,ij->i', offsets, offsets)
     flock = np.concatenate([np.zeros((1, differences.shape[1])), differences[~others]])
-    scale = np.where(others[:, None], pair_disagreement(differences), disagreement(flock))
+    scale = np.where(others, pair_disagreement(differences), disagreement(flock))
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
-    joined = share[:, None]
-    u: Array = (joined * (alignment(r2, params) * differences + pull * offsets)
-                - (1.0 - joined) * apart * fade(r2, params) * offsets).sum(axis=0)
-    return u
+    push = (1.0 - share) * apart * fade(r2, params)
+    return (share * alignment(r2, params)) @ differences + (share * pull - push) @ offsets
 
 
 def fade(r2: Array, params: FlockingParams) -> Array:
     """Return psi at r2, m^2: 1 up to d0 + 0.28 (d1 - d0), then falling to 0 at d1."""
     begin = params.d0 + _FADE * (params.d1 - params.d0)
-    y = np.minimum(np.maximum((r2 - begin) / (params.d1 - begin), 0.0), 1.0) - 0.5
-    square, sine = y * y, np.full_like(y, _SINE[-1])
-    for coefficient in _SINE[-2::-1]:
-        sine *= square
-        sine += coefficient
-    return 0.5 - 0.5 * y * sine
+    far = np.minimum(np.maximum((r2 - begin) / (params.d1 - begin), 0.0), 1.0)
+    return 0.5 + 0.5 * np.cos(math.pi * far)
 
 
 def pair_disagreement(differences: Array) -> Array:
-    """Return L, m/s, of each single pair of agents, from v_j - v_i (..., n)."""
-    return np.sqrt((differences ** 2).sum(axis=-1, keepdims=True)) / math.sqrt(2.0)
+    """Return L, m/s, of each single pair of agents (m,), from v_j - v_i (m, n)."""
+    return np.sqrt(np.einsum('ij,ij->i', differences, differences) / 2.0)
 
 
 def _lengths(vectors: Array) -> Array:
