@@ -38,7 +38,6 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import (
     Array,
-    quaternion_to_matrix,
     rotation_vector_to_matrix,
     skew,
 )
@@ -99,9 +98,10 @@ class OwnPath:
     @cached_property
     def _motion(self) -> Array:
         """Return positions, m, and velocities in base_link, m/s, as rows (n, 6)."""
-        return np.array([
-            [*state.position, *(state.velocity @ quaternion_to_matrix(state.quaternion))]
-            for state in self._states])
+        velocities = np.array([state.velocity for state in self._states])
+        rotations = np.array([state.twist_rotation for state in self._states])
+        return np.column_stack([np.array([state.position for state in self._states]),
+                                np.einsum('ni,nij->nj', velocities, rotations)])
 
     def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return attitudes (m, 4) at stamps (m,), s, and which of them are known (m,)."""
@@ -145,14 +145,17 @@ def measure_shifts(before: Array, after: Array, width: int) -> Array:
     window = cv2.createHanningWindow((columns, height), cv2.CV_32F)
     last = np.array([COMPARED_WIDTH - columns, before.shape[0] - height])
     for n, (row, column) in enumerate(product(range(PART_ROWS), range(PART_COLUMNS))):
-        first = np.array([column * columns, row * height])
-        for _ in range(2):
-            second = np.clip(first + np.rint(found[n, :2]).astype(int), 0, last)
-            first = np.clip(second - np.rint(found[n, :2]).astype(int), 0, last)
+        first = second = np.array([column * columns, row * height])
+        while True:
             old, new = (image[y:y + height, x:x + columns]
                         for image, (x, y) in ((before, first), (after, second)))
             more, quality = cv2.phaseCorrelate(old - old.mean(), new - new.mean(), window)
             found[n] = *(second - first + more), quality
+            shift = np.rint(found[n, :2]).astype(int)
+            if second is not first or not shift.any():
+                break
+            second = np.clip(first + shift, 0, last)
+            first = np.clip(second - shift, 0, last)
     return found * [width / COMPARED_WIDTH, width / COMPARED_WIDTH, 1.0]
 
 
