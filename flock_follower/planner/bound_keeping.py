@@ -165,9 +165,9 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     firm = [bound for bound, side in zip(bounds, sides) if side[2] != COHESION]  # come first
     point = nearest_in_order(goal, firm, discs)
     if len(firm) < len(bounds):
-        bounds[len(firm):] = yielding = [_yielding(*bound, goal, point, firm, Discs(
+        bounds[len(firm):] = reduced = [_reduce_cohesion(*bound, goal, point, firm, Discs(
             *smooth, *smooth)) for bound in bounds[len(firm):]]
-        if any(product(normal, point) < least for normal, least in yielding):
+        if any(product(normal, point) < least for normal, least in reduced):
             point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.
@@ -179,7 +179,7 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
 
 
-def _yielding(normal: complex, least: float, goal: complex, start: complex,
+def _reduce_cohesion(normal: complex, least: float, goal: complex, start: complex,
               firm: Sequence[Side], by_speed: Discs) -> Side:
     """
     Return a cohesion bound, reduced first by ``COHESION_INSISTENCE``: see ``keep_bounds``.

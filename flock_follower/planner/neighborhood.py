@@ -135,9 +135,9 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     if len(follow) < 2:
         return frozenset(n.name for n in follow)
     joined = neighbor_graph.edges(
-        me.position, np.array([n.position for n in follow]),
-        np.array([params.radius + n.member.radius for n in follow]), params.radius,
-        np.array([n.name in held for n in follow]))
+        me.position.tolist(), [n.position.tolist() for n in follow],
+        [params.radius + n.member.radius for n in follow], params.radius,
+        [n.name in held for n in follow])
     seen = [n for n in follow if not n.received]
     # A received position never removes the edge to the only leader in sight. Beyond the band such
     # an edge does not begin beside others: it would pull past the vehicle between.
@@ -145,7 +145,7 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
         not held or n.name in held
         or max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0) ** 2
         < params.law.d1)]
-    return frozenset(n.name for n, edge in zip(follow, joined.tolist()) if edge or n.name in kept)
+    return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 
 def _find_nearest(distances: Mapping[str, float], held: str,
