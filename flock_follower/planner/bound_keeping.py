@@ -162,11 +162,14 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     within = complex(0.0 - vx / period, 0.0 - vy / period), left / period
     smooth = complex(lost_x - vx / slowly, lost_y - vy / slowly), left / slowly
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
-    firm = [bound for bound, side in zip(bounds, sides) if side[2] != COHESION]  # come first
+    # Cohesion comes last in the order: the other bounds are firm.
+    firm = [bound for bound, side in zip(bounds, sides) if side[2] != COHESION]
     point = nearest_in_order(goal, firm, discs)
     if len(firm) < len(bounds):
-        bounds[len(firm):] = reduced = [_reduce_cohesion(*bound, goal, point, firm, Discs(
-            *smooth, *smooth)) for bound in bounds[len(firm):]]
+        by_speed = Discs(*smooth, *smooth)
+        reduced = [_reduce_cohesion(*bound, goal, point, firm, by_speed)
+                   for bound in bounds[len(firm):]]
+        bounds = [*firm, *reduced]
         if any(product(normal, point) < least for normal, least in reduced):
             point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
