@@ -41,6 +41,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -220,11 +221,11 @@ class CameraModel:
         np.multiply(x_y, x_y, out=products[:2])
         r2 = products[0] + products[1]
         g = self._radial(r2)
-        if not np.maximum.reduce(r2, initial=0.0) <= self.radius**2:
+        if cv2.norm(r2, cv2.NORM_INF) > self.radius**2:
             g = np.where(r2 <= self.radius**2, g, np.nan)
         distorted = x_y * g
         if self._aside is not None:
-            np.multiply(*x_y, out=products[2])
+            np.multiply(x_y[0], x_y[1], out=products[2])
             distorted += self._aside.dot(products)
         if self._prism is not None:
             s1, s2, s3, s4 = self._prism
