@@ -18,7 +18,7 @@ Measure perception on path-traced flights: CPU time of the mean and of the worst
 ``python benchmarks/path_traced.py [--rows room_hover room_hover/flare ...]``. A row is a flight of
 ``../shared/data/rendered``, which are not in this repository, and an effect of the tool ``bag.py``
 there, which makes a bag of both. The bags are written once, into ``build/bags/path_traced``. Every
-image goes through OpenCV's default detector and through ours, in turns as in ``perception.py``,
+image goes through OpenCV's default detector and through ours, in turns as in ``flight.py``,
 and through aruco2 if it is installed (see ``detectors.py``). The default's mean in the same run is
 the unit: milliseconds of a busy machine mean little.
 
@@ -40,8 +40,8 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
+from flight import BAGS, Flight, WRONG
 import numpy as np
-from perception import BAGS, Flight, WRONG
 
 from flock_follower.perception.images import compute_in_one_thread
 
