@@ -22,6 +22,7 @@ is kept for 2 s. The measure is this process's CPU time; decoding is outside.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 import gc
@@ -30,6 +31,7 @@ import time
 from typing import Any, NamedTuple
 
 from detectors import ARUCO, detectors, Look
+from earlier import Earlier
 import numpy as np
 
 from flock_desk.camera.renderer import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
@@ -112,22 +114,26 @@ class Flight:
 
     :param count: images to play, 0 for all.
     :param dictionary: of the leader's marker.
-    :param others: names of the detectors beside ours, None for all.
+    :param omitted: names of detectors that do not take part.
+    :param earlier: name of an earlier package that takes part, see ``earlier.py``.
     """
 
-    def __init__(self, bag: Path, count: int, dictionary: str = ARUCO,
-                 others: Sequence[str] | None = None) -> None:
+    def __init__(self, bag: Path, count: int, dictionary: str = ARUCO, *,
+                 omitted: Sequence[str] = (), earlier: str | None = None) -> None:
         self.config = replace(neighbors.load(resource('config/neighbors.yaml')),
                               dictionary=dictionary)
-        found = detectors(dictionary)
-        self.detectors = {name: found[name] for name in others or found}
-        self.methods = (*self.detectors, 'ours')
+        self.detectors = {name: corners for name, corners in detectors(dictionary).items()
+                          if name not in omitted}
+        self.package = earlier
+        self.earlier = self._new_earlier()
+        self.methods = (*self.detectors, *(['before'] if self.earlier else []), 'ours')
         self.milliseconds: dict[str, list[float]] = {m: [] for m in self.methods}
         self.errors = {m: FrameErrors(self.config.neighbors, T_BODY_OPTICAL, START_NS)
                        for m in self.methods}
         self.perceiver = perceiver(self.config)
         self.looks: dict[str, Look] = {}
         self.own: list[OdometryState] = []
+        self.odometry: deque[Any] = deque(maxlen=3)  # the last messages
         self.last: dict[str, tuple[int, Array]] = {}  # where each detector saw the leader
         #: Stamps, ns and s, pixels and calibration.
         self.waiting: list[tuple[int, float, GrayImage, CameraModel]] = []
@@ -145,7 +151,10 @@ class Flight:
         message = deserialize(data, msgtype)
         if topic == '/odom':
             self.own.append(from_odometry(message))
+            self.odometry.append(message)
             self.perceiver.take_odometry(self.own[-1])
+            if self.earlier is not None:
+                self.earlier.take_odometry(message)
             for errors in self.errors.values():
                 errors.odometry(self.own[-1])
         elif topic == '/truth/odom':
@@ -156,6 +165,8 @@ class Flight:
                 errors.truth(from_odometry(message))
         elif topic == '/camera_info':
             self.info = message
+            if self.earlier is not None:
+                self.earlier.take_camera_info(message)
             if self.perceiver.take_camera_info(message):
                 model = self.perceiver.model()
                 assert model is not None
@@ -195,7 +206,11 @@ class Flight:
         look = self.looks.get(method)
         start = time.process_time_ns()
         if look is None:
-            sighting = Tracker.process_image(self.perceiver.tracker, seconds, image, model)
+            if method == 'before':
+                assert self.earlier is not None
+                sighting = self.earlier.process_image(stamp, image)
+            else:
+                sighting = Tracker.process_image(self.perceiver.tracker, seconds, image, model)
             spent = time.process_time_ns() - start
             self.errors[method].frame(stamp, sighting.estimates, sighting.stages)
         else:
@@ -213,10 +228,20 @@ class Flight:
             other.take_odometry(state)
             Tracker.process_image(other.tracker, 1e-9 * (state.stamp - self.own[-3:][0].stamp),
                                   image, model)
+        if (earlier := self._new_earlier()) is not None:
+            earlier.take_camera_info(self.info)
+            for message in self.odometry:
+                earlier.take_odometry(message)
+                earlier.process_image(stamp_to_nanoseconds(message.header.stamp), image)
         for look in self.looks.values():
             look(image)
         gc.collect()
         gc.freeze()  # as the node does before it spins
+
+    def _new_earlier(self) -> Earlier | None:
+        if self.package is None:
+            return None
+        return Earlier(self.package, self.config.dictionary, T_BODY_OPTICAL)
 
     def state(self, method: str, stamp: int, T_camera_marker: Transform) -> State:
         """Return a detector's state of the leader, its velocity from two positions."""
