@@ -36,7 +36,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import Array, quaternion_to_matrix, skew
+from flock_follower.geometry import Array, skew
 from flock_follower.geometry.rotation_vectors import rotation_vector_to_matrix
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.perception.camera import CameraModel
@@ -95,9 +95,10 @@ class OwnPath:
     @cached_property
     def _motion(self) -> Array:
         """Return positions, m, and velocities in base_link, m/s, as rows (n, 6)."""
-        return np.array([
-            [*state.position, *(state.velocity @ quaternion_to_matrix(state.quaternion))]
-            for state in self._states])
+        velocities = np.array([state.velocity for state in self._states])
+        rotations = np.array([state.twist_rotation for state in self._states])
+        return np.column_stack([np.array([state.position for state in self._states]),
+                                np.einsum('ni,nij->nj', velocities, rotations)])
 
     def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return attitudes (m, 4) at stamps (m,), s, and which of them are known (m,)."""
@@ -141,14 +142,17 @@ def measure_shifts(before: Array, after: Array, width: int) -> Array:
     window = cv2.createHanningWindow((columns, height), cv2.CV_32F)
     last = np.array([COMPARED_WIDTH - columns, before.shape[0] - height])
     for n, (row, column) in enumerate(product(range(PART_ROWS), range(PART_COLUMNS))):
-        first = np.array([column * columns, row * height])
-        for _ in range(2):
-            second = np.clip(first + np.rint(found[n, :2]).astype(int), 0, last)
-            first = np.clip(second - np.rint(found[n, :2]).astype(int), 0, last)
+        first = second = np.array([column * columns, row * height])
+        while True:
             old, new = (image[y:y + height, x:x + columns]
                         for image, (x, y) in ((before, first), (after, second)))
             more, quality = cv2.phaseCorrelate(old - old.mean(), new - new.mean(), window)
             found[n] = *(second - first + more), quality
+            shift = np.rint(found[n, :2]).astype(int)
+            if second is not first or not shift.any():
+                break
+            second = np.clip(first + shift, 0, last)
+            first = np.clip(second - shift, 0, last)
     return found * [width / COMPARED_WIDTH, width / COMPARED_WIDTH, 1.0]
 
 

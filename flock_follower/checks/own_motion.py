@@ -202,10 +202,11 @@ def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
 
 
 def _twist(motion: OwnMotion) -> Finding:
-    twist = motion.source.twist
+    twist, invalid = motion.source.twist, motion.events['odom velocity invalid']
     return first(
         'odom velocity', 'as its positions move',
         ('velocity' in motion.source.missing, WARNING, 'none (not finite)', DERIVED),
+        (invalid, WARNING, f'invalid {invalid} times', f'{DERIVED}, and steps each time'),
         (twist.wanted in (CHILD, ODOM) and twist.found not in ('', twist.wanted), ERROR,
          f'read in {twist.wanted}, the positions fit {twist.found}',
          'set odom_twist_frame:=auto'),

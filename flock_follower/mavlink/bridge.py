@@ -407,6 +407,7 @@ class Bridge:
         if self.gate.permission.phase is not Phase.TAKEN_OVER:
             self._reported_taker = None
         self._attribute_takeover(now)
+        self.requests.observe(status)
 
     def _attribute_takeover(self, now: float) -> None:
         """Determine who has taken over; report it once known, or after EVIDENCE_AFTER."""

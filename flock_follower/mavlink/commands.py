@@ -20,6 +20,9 @@ ACCEPTED. A request succeeds when telemetry shows the result (the mode in HEARTB
 after a take-off). If telemetry does not show the result, the ACK and the autopilot's STATUSTEXT
 give the reason. A HEARTBEAT from before the command does not count.
 
+A pilot may switch the mode after a command. So a command is sent again only when a new report
+shows that the mode has not changed; without reports it is sent during BURST_TIME only.
+
 ``Goal`` is the requested state, ``Request`` the state machine that pursues it.
 """
 
@@ -39,8 +42,13 @@ from flock_follower.ranges import first_reason
 
 #: How long to wait for HEARTBEAT (1 Hz) to show the result, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
-#: An unanswered command is sent again after this, s.
+#: An unanswered command is sent again after this, s ...
 RESEND_PERIOD: Final[float] = 1.0
+#: ... if the newest report of the mode is at most this old, s: a cycle at 5 Hz.
+NEW_REPORT: Final[float] = 0.25
+#: What ends a flight is sent in each cycle for this long, s, until an answer or a report comes; no
+#: pilot switches as soon as that.
+BURST_TIME: Final[float] = 0.3
 #: After a refusal, wait this long for the text that explains it, s.
 REASON_WAIT: Final[float] = 0.5
 #: Longest delay of a take-off, s; ArduPilot spools up for seconds.
@@ -191,6 +199,8 @@ class Request:
         self._dialect = dialect
         self._superseded = superseded
         self._refused: list[str] = []
+        self._shown = ''
+        self._left: set[str] = set()  # the modes that were shown, and left
         self._next = goal if goal.before is not None else None
         self._begin(goal.before or goal, now, '')
 
@@ -226,7 +236,8 @@ class Request:
             return None
         if not self._attempts:
             missing = first_reason(
-                (vehicle is None and not self.current.ends_flight, NOT_RECEIVED),
+                (vehicle is None and not (
+                    self.current.ends_flight and self.current is self.goal), NOT_RECEIVED),
                 (streaming_for < self.current.stream,
                  f'no setpoint stream has been running for {self.current.stream} s'))
             if not missing:
@@ -244,13 +255,29 @@ class Request:
             holds = vehicle is not None and vehicle.status.mode == self._dialect.hold
             late = None if holds else self.current.too_late
             self._fail(self._unconfirmed_reason(vehicle, texts), late or instead, vehicle, now)
-        elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
-                # The ACK does not identify the request: it may answer an earlier mode command. If
-                # it answers this one, the pilot may have left the mode between two HEARTBEATs:
-                # only a command that ends a flight is sent again.
-                self.current.ends_flight and self.current.command == _SET_MODE)):
+        elif self._may_repeat(vehicle, now):
             return self._send(now)
         return None
+
+    def _may_repeat(self, vehicle: Vehicle | None, now: float) -> bool:
+        """Return whether to send the command again: not if a pilot may have switched since."""
+        if vehicle is None or not vehicle.shown_time > self._last_sent:
+            return self.current.ends_flight and self._result is None and (
+                now - self._since <= BURST_TIME)
+        if now - self._last_sent < RESEND_PERIOD or now - vehicle.shown_time > NEW_REPORT:
+            return False
+        # The ACK does not identify the request: it may answer an earlier mode command. If it
+        # answers this one, the pilot may have left the mode between two HEARTBEATs: only a command
+        # that ends a flight of our setpoints is sent again.
+        return self._result is None or (
+            self.current.ends_flight and self.current.command == _SET_MODE
+            and (vehicle.status.offboard or self._superseded is not None))
+
+    def observe(self, mode: str) -> None:
+        """Take the mode in each report, also of several that arrive together."""
+        if mode != self._shown:
+            self._left.add(self._shown)
+            self._shown = mode
 
     def refuse(self, message: str) -> Request:
         """End the request with a reason, and return self."""
@@ -260,6 +287,7 @@ class Request:
     def _is_shown(self, vehicle: Vehicle, now: float) -> bool:
         """Return whether the vehicle has reached the goal, so that nothing is sent now, s."""
         self._mode = self._mode or vehicle.status.mode
+        self.observe(vehicle.status.mode)
         insists = self.current.insists or self._superseded is not None
         if self.current.reached(vehicle) and (self._attempts or not insists):
             if vehicle.shown_time > self._since:
@@ -297,7 +325,10 @@ class Request:
                     *(self._superseded.modes if self._superseded is not None else ()),
                     # One leads to the next.
                     *(through if self._mode in through else ())}
-        return '' if status.mode in expected or not self.current.modes else (
+        # Only a pilot returns to a mode, except to the one after a take-off.
+        known = status.mode in expected and (status.mode not in self._left or (
+            status.mode in through))
+        return '' if known or not self.current.modes else (
             f'the mode was changed to {status.mode} meanwhile')
 
     def _send(self, now: float) -> int:

@@ -125,6 +125,11 @@ class Requests:
                 ack.command, ack.result, now):
             self._housekeeping.request_reasons()
 
+    def observe(self, status: VehicleStatus) -> None:
+        """Take the status in each HEARTBEAT or CURRENT_MODE, also of two that arrive at once."""
+        if self.pending is not None:
+            self.pending.observe(status.mode)
+
     def begin(self, make: Callable[[Dialect], Goal], now: float, obstacle: str = '',
               end: Handover = NO_HANDOVER) -> Request:
         """

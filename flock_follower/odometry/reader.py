@@ -232,11 +232,11 @@ class OdometrySource:
         self._lacks('angular velocity', not turning, 'derived from the attitudes')
         velocity = self._read(time, position, R_odom_child, linear, skew(
             rotation.dot(angular)).dot(lever) if self._levers else None)
-        pose_covariance, twist_covariance = self._covariances(message, rotation, lever)
+        derived = linear is None or self._reading == NONE
+        pose_covariance, twist_covariance = self._covariances(message, rotation, lever, derived)
         return OdometryState(
             stamp, message.header.frame_id, message.child_frame_id, position, quaternion,
-            velocity, angular, pose_covariance, twist_covariance, rotation,
-            linear is None or self._reading == NONE)
+            velocity, angular, pose_covariance, twist_covariance, rotation, derived)
 
     def _is_new(self, stamp: int, frames: tuple[str, str]) -> bool:
         """Return whether to use a message; restart after a jump of time or frame."""
@@ -273,9 +273,11 @@ class OdometrySource:
               lever_velocity: Array | None) -> Array:
         """Return the velocity (3,) of base_link in odom, m/s."""
         before = self._reading
+        if linear is None and 'velocity' not in self.missing:
+            self.events.append(('odom velocity invalid', 'derived from the positions meanwhile'))
+        self._lacks('velocity', linear is None, 'derived from the positions')
         if linear is None:
             velocity = self.motion.velocity_at(time)
-            self._lacks('velocity', True, 'derived from the positions')
         else:
             child, odom = R_odom_child.dot(linear), linear
             if lever_velocity is not None:
@@ -301,8 +303,13 @@ class OdometrySource:
             return self.motion.velocity_at(time)
         return child if reading == CHILD else odom
 
-    def _covariances(self, message: Any, rotation: Array, lever: Array) -> tuple[Array, Array]:
-        """Return the covariances (6, 6) of pose and twist as messages have them, of base_link."""
+    def _covariances(self, message: Any, rotation: Array, lever: Array,
+                     derived: bool) -> tuple[Array, Array]:
+        """
+        Return the covariances (6, 6) of pose and twist as messages have them, of base_link.
+
+        :param derived: whether the velocity is derived from the positions.
+        """
         pose = self._complete_covariance('pose', message.pose.covariance, self._std[:2])
         if self._levers:
             lever_matrix = np.eye(6)
@@ -315,11 +322,11 @@ class OdometrySource:
             turn[:3, :3] = rotation.T if self._reading == ODOM else to_base
             turn[3:, 3:] = to_base
             twist = turn.dot(twist).dot(turn.T)
-        if self._reading == NONE:
+        if derived:
             twist = twist.copy()
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.variance_of_velocity
-        wrong = 0.0 if self._reading == NONE else self.twist.wrong_probability
+        wrong = 0.0 if derived else self.twist.wrong_probability
         for share, off in ((wrong, self._doubt), (1.0, self._fading)):
             # The velocity may be the other reading, and a step being faded out is an error.
             if share and off is not None and np.count_nonzero(off):

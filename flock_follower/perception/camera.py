@@ -41,6 +41,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -107,12 +108,12 @@ class CameraModel:
             Range(low, high, 'px').check(f'K: focal length for {width}x{height}', focal)
         for share in (self.matrix[:2, 2] / (width, height)).tolist():
             AXIS_RANGE.check(f'K: optical axis as a share of {width}x{height}', share)
-        self._transposed, self._middle = self.matrix[:2, :2].T, self.matrix[:2, 2]
+        self._linear, self._middle = self.matrix[:2, :2], self.matrix[:2, 2:]
         fisheye = self.model == 'equidistant'
         p1, p2 = self._tangential = (0.0, 0.0) if fisheye else self.distortion[2:4].tolist()
-        # x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y').
+        # This times x x, y y, x y (3, n): what p1 and p2 add to (x', y').
         self._aside: Array | None = np.array(
-            [[3.0 * p2, p1], [p2, 3.0 * p1], [2.0 * p1, 2.0 * p2]]) if p1 or p2 else None
+            [[3.0 * p2, p2, 2.0 * p1], [p1, 3.0 * p1, 2.0 * p2]]) if p1 or p2 else None
         # Of rational_polynomial: the thin prism, (4,), and the tilt of the sensor, (3, 3).
         self._prism = self.distortion[8:12] if self.distortion[8:12].any() else None
         self._tilt = _tilt(*self.distortion[12:14]) if self.distortion[12:14].any() else None
@@ -214,30 +215,31 @@ class CameraModel:
 
         NaN if the distortion is not one-to-one there.
         """
-        squares = xy * xy
-        r2 = squares[:, 0] + squares[:, 1]
+        # Rows of x and of y: numpy takes a row in one loop, but a column of two in many.
+        x_y = xy.T
+        products = np.empty((3, len(xy)))
+        np.multiply(x_y, x_y, out=products[:2])
+        r2 = products[0] + products[1]
         g = self._radial(r2)
-        if not np.maximum.reduce(r2, initial=0.0) <= self.radius**2:
+        if cv2.norm(r2, cv2.NORM_INF) > self.radius**2:
             g = np.where(r2 <= self.radius**2, g, np.nan)
-        distorted = xy * g[:, None]
+        distorted = x_y * g
         if self._aside is not None:
-            products = np.empty((3, len(xy))).T
-            products[:, :2] = squares
-            np.multiply(xy[:, 0], xy[:, 1], out=products[:, 2])
-            distorted += products.dot(self._aside)
+            np.multiply(x_y[0], x_y[1], out=products[2])
+            distorted += self._aside.dot(products)
         if self._prism is not None:
             s1, s2, s3, s4 = self._prism
-            distorted += r2[:, None] * np.column_stack([s1 + s2 * r2, s3 + s4 * r2])
+            distorted += r2 * np.stack([s1 + s2 * r2, s3 + s4 * r2])
         if self._tilt is not None:
-            tilted = distorted @ self._tilt[:, :2].T + self._tilt[:, 2]
-            distorted = tilted[:, :2] / tilted[:, 2:]
-        pixels: Array = distorted.dot(self._transposed)
+            tilted = self._tilt[:, :2].dot(distorted) + self._tilt[:, 2:]
+            distorted = tilted[:2] / tilted[2]
+        pixels: Array = self._linear.dot(distorted)
         pixels += self._middle
-        return pixels
+        return pixels.T
 
     def linear_map(self, x: float, y: float) -> Array:
         """Return d pixel / d (x, y), (2, 2), px, at one place in normalized coordinates."""
-        mapped: Array = self.matrix[:2, :2].dot(np.array(self._slopes(x, y)).reshape(2, 2))
+        mapped: Array = self._linear.dot(np.array(self._slopes(x, y)).reshape(2, 2))
         return mapped
 
     def linearize(self, points: ArrayLike) -> tuple[Array, Array]:
@@ -266,7 +268,7 @@ class CameraModel:
         """
         pixels = np.asarray(pixels, dtype=float).reshape(-1, 2)
         inverse = np.linalg.inv(self.matrix[:2, :2]).T
-        xy = (pixels - self._middle) @ inverse
+        xy = (pixels - self._middle.T) @ inverse
         for _ in range(50):
             # Out of the one-to-one region Newton would wander: hold it at the edge.
             length = np.linalg.norm(xy, axis=1, keepdims=True)

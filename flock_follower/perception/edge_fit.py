@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
@@ -157,9 +158,9 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
     return Found(offsets, found, (-top / bend) * (step * step), (first, second))
 
 
-def _separate_edges(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
+def _separate_edges(lines: Lines, found: Found) -> tuple[float, float]:
     """
-    Return the edges without the shifts by adjacent edges, and the blur of each axis, px.
+    Subtract the shifts by adjacent edges from ``found``, and return the blur of each axis, px.
 
     Blurred by s in all, an edge at 0 and its opposite at d give the smoothed derivative
     C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
@@ -168,7 +169,8 @@ def _separate_edges(lines: Lines, found: Found) -> tuple[Found, tuple[float, flo
     model, offsets = lines.model, found.offsets
     known = found.known
     variance = _typical(found.variance, known)
-    if any(cell**2 < _UNDISTURBED_BEYOND * v for cell, v in zip(lines.narrowest, variance)):
+    (cell_x, cell_y), (blur_x, blur_y) = lines.narrowest, variance
+    if cell_x**2 < _UNDISTURBED_BEYOND * blur_x or cell_y**2 < _UNDISTURBED_BEYOND * blur_y:
         room = model.room * np.array(lines.scale)[model.axis][:, None]
         square = room * room
         for again in (True, True, False):
@@ -179,7 +181,7 @@ def _separate_edges(lines: Lines, found: Found) -> tuple[Found, tuple[float, flo
             if again:
                 variance = _typical(found.variance * bend / (1.0 - e.dot(_ONES)), known)
         offsets -= (room * e).dot(_DIFFERENCE) / bend
-    return found._replace(offsets=offsets), (math.sqrt(variance[0]), math.sqrt(variance[1]))
+    return math.sqrt(variance[0]), math.sqrt(variance[1])
 
 
 def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
@@ -202,7 +204,7 @@ def _match_spacing(lines: Lines, blur: list[float]) -> tuple[float, float]:
 def _widen_for_bloom(spacing: tuple[float, float], bloom: Array) -> tuple[float, float]:
     """Return the spacing, px, with which profiles reach edges that bloom has shifted."""
     first, second = (each + shift / _HALF_WIDTH if shift > MAX_PLAIN_BLOOM else each
-                     for each, shift in zip(spacing, np.abs(bloom).tolist()))
+                     for each, shift in zip(spacing, map(abs, bloom.tolist())))
     return first, second
 
 
@@ -309,7 +311,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         found = None if lines is None or spacing is None else _find(image, lines, spacing, bloom)
         if lines is None or spacing is None or found is None:
             return None
-        found, widths = _separate_edges(lines, found)
+        widths = _separate_edges(lines, found)
         step = _solve(lines, found, last)
         turn = math.inf if step is None else max(map(abs, step.step[3:6].tolist()))
         if step is None or not turn < MAX_TURN_STEP:
@@ -320,9 +322,9 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
                 for width, each in zip(widths, spacing)]
         suited = _match_spacing(lines, blur)
         alike = all(1.0 / _MAX_MISMATCH < a / b < _MAX_MISMATCH for a, b in zip(suited, spacing))
-        before, share = share, float(step.weights.sum()) / len(model)
+        before, share = share, step.weight / len(model)
         clear = share > _REFIND_BELOW or (count > 0 and share < before + _LEAST_GAIN)
-        farthest, turned = float(np.abs(step.explained).max()), turn > _REPROJECT_TURN
+        farthest, turned = cv2.norm(step.explained, cv2.NORM_INF), turn > _REPROJECT_TURN
         near = _REFIND_BEYOND * min(lines.narrowest)
         settled = farthest * farthest < near and alike and clear and not turned
         if settled or count == _MAX_PASSES - 1:
@@ -340,9 +342,10 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
 def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
                spacing: tuple[float, float], blur: list[float]) -> EdgeFit | None:
     """Return the fit after the last step; None if it is poor or a direction is undetermined."""
-    if not (last.weights.dot(lines.model.bloom) < -_MIN_AXIS_SHARE * lines.model.counts).all():
-        return None
-    degrees = max(float(last.weights.sum()) - 8.0, 1.0)
+    for weight, count in zip(last.weights.dot(lines.model.bloom).tolist(), lines.model.counts):
+        if not -weight > _MIN_AXIS_SHARE * count:
+            return None
+    degrees = max(last.weight - 8.0, 1.0)
     square = float(last.weights.dot(last.squares)) / degrees
     in_place = found.found & (last.squares < max(MAX_INLIER_ERROR**2, 9.0 * square))
     inlier_share, rms = np.count_nonzero(in_place) / len(lines.model), math.sqrt(square)
@@ -355,15 +358,16 @@ def _build_fit(pose: Transform, lines: Lines, found: Found, last: _Step,
         pose, lines.center, covariance[:6, :6], rms, float(weights.dot(last.squares)) / degrees,
         degrees, inlier_share, _widen_for_bloom(spacing, last.step[6:]),
         max(width / cell for width, cell in zip(blur, lines.narrowest)),
-        float(np.abs(last.step[6:]).max()), lines, last.residual, weights)
+        max(map(abs, last.step[6:].tolist())), lines, last.residual, weights)
 
 
 class _Step(NamedTuple):
     """
     A least-squares step (8,), the motion of the edges, (n,), px, and their residuals, px^2.
 
-    ``weights`` (n,): how much each edge counts, 0..1, 0 if it was not found; ``variance``
-    (2,): of where an edge of either axis is, px^2. ``information`` (8, 8) of the step.
+    ``weights`` (n,): how much each edge counts, 0..1, 0 if it was not found; ``weight``: their
+    sum; ``variance`` (2,): of where an edge of either axis is, px^2. ``information`` (8, 8) of the
+    step.
     """
 
     step: Array
@@ -371,6 +375,7 @@ class _Step(NamedTuple):
     residual: Array
     squares: Array
     weights: Array
+    weight: float
     variance: Array
     information: Array
 
@@ -405,7 +410,8 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
         weights = 1.0 - squares / np.maximum(16.0 * variance, MAX_INLIER_ERROR**2)[axis]
         weights = np.maximum(weights, 0.0)**2 * found.found
     explained = design[:, :6].dot(step[:6])
-    return _Step(step, explained, residual, squares, weights, variance, information)
+    return _Step(step, explained, residual, squares, weights, float(np.add.reduce(weights)),
+                 variance, information)
 
 
 def _robust(squares: Array) -> float:

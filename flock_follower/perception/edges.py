@@ -50,8 +50,6 @@ _LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
 _ONES = np.ones(2)
 #: Sums both columns of (n, 2), negated.
 _MINUS = -_ONES
-#: Sums all columns of (n, 3).
-_SUM = np.ones(3)
 #: A row vector times this is turned by a right angle.
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 #: a x b of rows a, b: their outer products, (n, 9), times this.
@@ -99,8 +97,9 @@ class Lines(NamedTuple):
 
     ``pixels`` and ``normals`` (n, 2), px, unit, from black to white; ``design`` (n, 8): the motion
     of each edge along its normal, px, by a step of ``center`` (3,), m, a turn about it, rad, and
-    the two shifts of bloom, px. ``scale`` (2,): px per m across edges of either axis.
-    ``cells`` (c, 2), px: the middles of the markers' cells.
+    the two shifts of bloom, px. ``scale`` (2,): px per m across edges of either axis;
+    ``narrowest`` (2,): the least distance of two edges along each axis, px. ``cells`` (c, 2), px:
+    the middles of the markers' cells.
     """
 
     model: EdgeModel
@@ -109,13 +108,8 @@ class Lines(NamedTuple):
     design: Array
     center: Array
     scale: tuple[float, float]
+    narrowest: tuple[float, float]
     cells: Array
-
-    @property
-    def narrowest(self) -> tuple[float, float]:
-        """Return the least distance of two edges along each axis, px."""
-        (across_x, across_y), (x, y) = self.model.narrowest, self.scale
-        return across_x * x, across_y * y
 
     def after_step(self, step: Array, by_step: Array) -> Lines:
         """Return the lines after a small step (6,) or more, which moves them by (n,), px."""
@@ -123,13 +117,15 @@ class Lines(NamedTuple):
                              center=self.center + step[:3])
 
 
-def facing(model: EdgeModel, pose: Transform) -> Any:
-    """Return which markers face the camera, with an angle below 80 degrees, (m,)."""
+def facing(model: EdgeModel, pose: Transform) -> tuple[bool, ...]:
+    """Return for each marker whether it faces the camera, with an angle below 80 degrees."""
     if not has_converged(pose):
-        return np.zeros(len(model.centers), dtype=bool)
-    sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
-    along = (sight * model.facings).dot(_SUM)
-    return -along > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
+        return (False,) * len(model.codes)
+    to_body = pose.translation.dot(pose.rotation)  # along the body's axes
+    # In plain numbers: for every image, and so few.
+    return tuple(-(x * u + y * v + z * w) > _LEAST_FACING * math.hypot(x, y, z)
+                 for (x, y, z), (u, v, w) in zip(
+                     (model.centers + to_body).tolist(), model.facings.tolist()))
 
 
 def has_converged(pose: Transform) -> bool:
@@ -148,16 +144,17 @@ def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | N
     R = pose.rotation.T
     places = model.places.dot(R)
     places += pose.translation
-    if not count or not np.minimum.reduce(places[:, 2]) > _LEAST_DEPTH:
+    if not count or np.count_nonzero(places[:, 2] > _LEAST_DEPTH) < len(places):
         return None
     xy = places[:, :2] / places[:, 2:]
     pixels = camera.distort(xy)
-    if not math.isfinite(pixels.sum()):
+    if not math.isfinite(cv2.norm(pixels)):
         return None
     points, xy = places[:count], xy[:count]
     center = model.shares.dot(points)
     # The lens bends little over one marker: its linear map in the middle serves for directions.
-    lens = camera.linear_map(float(center[0] / center[2]), float(center[1] / center[2]))
+    x, y, z = center.tolist()
+    lens = camera.linear_map(x / z, y / z)
     # The normal in the image is across the projected tangent: projection keeps no right angles.
     tangents = model.tangents.dot(R)
     along = (tangents[:, :2] - tangents[:, 2:] * xy).dot(lens.T)
@@ -171,8 +168,9 @@ def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | N
     # A turn r moves a point by r x arm, and g . (r x arm) = (arm x g) . r.
     design[:, 3:6] = cross(points - center, design[:, :3])
     design[:, 6:] = model.bloom
-    return Lines(model, pixels[:count], normals, design, center,
-                 _scale(along, model.examples, float(center[2])), pixels[count:])
+    (scale_x, scale_y), (room_x, room_y) = _scale(along, model.examples, z), model.narrowest
+    return Lines(model, pixels[:count], normals, design, center, (scale_x, scale_y),
+                 (room_x * scale_x, room_y * scale_y), pixels[count:])
 
 
 def cross(a: Array, b: Array) -> Array:

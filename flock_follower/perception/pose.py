@@ -23,7 +23,7 @@ the smeared print is fitted as a whole.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -229,7 +229,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
             if one.inlier_share > max(SHARP_INLIER_SHARE, min(
                 FOUND_INLIER_SHARE, 0.9 * max(each.inlier_share for each in near)))
             and (most_rms == 1.0 or one.blur < PLAIN_BLUR)  # blurred, edges of clutter look alike
-            and _find_shown(image, one).all()]
+            and all(_find_shown(image, one))]
     if not fits:
         return None if not most_rms or any(map(_sharp, near)) else _without_edges(
             image, camera, sought, index, starts, expected, most_rms)
@@ -248,7 +248,7 @@ def _starts_of(camera: CameraModel, sought: Target, index: int,
     """Return the edges of a detected marker alone, and both poses of its neighbor."""
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
-    return sought.model.only(np.arange(len(sought.model.codes)) == index), [
+    return sought.model.only(_alone(sought.model, index)), [
         pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
 
 
@@ -306,24 +306,29 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
                spacing: tuple[float, float] | None) -> _Shown:
     """Return a fit near ``start`` to those markers that show their codes."""
     turned = facing(model, start)
-    if not turned.any():
+    if not any(turned):
         return _Shown(None)
     seen = model.only(turned)
     found = fit(image, camera, seen, start, spacing)
     shown = None if found is None else _find_shown(image, found, True)
-    if shown is not None and shown.all():
+    if shown is not None and all(shown):
         return _Shown(found)
     if len(seen.codes) == 1:
         return _Shown(None) if found is None else _Shown(
             None, _sharp(found), found.blur < PLAIN_BLUR)
     if shown is None:  # one that is covered spoils them all
-        alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
+        alone = [fit(image, camera, seen.only(_alone(seen, k)), start, spacing)
                  for k in range(len(seen.codes))]
-        shown = np.array([f is not None and bool(_find_shown(image, f, True)[0]) for f in alone])
-    if not shown.any():
+        shown = tuple(f is not None and _find_shown(image, f, True)[0] for f in alone)
+    if not any(shown):
         return _Shown(None)
     found = fit(image, camera, seen.only(shown), start, spacing)
-    return _Shown(found if found is not None and _find_shown(image, found, True).all() else None)
+    return _Shown(found if found is not None and all(_find_shown(image, found, True)) else None)
+
+
+def _alone(model: EdgeModel, index: int) -> tuple[bool, ...]:
+    """Return one marker alone, as ``EdgeModel.only`` takes it."""
+    return tuple(k == index for k in range(len(model.codes)))
 
 
 def _plain(found: EdgeFit) -> bool:
@@ -340,14 +345,14 @@ def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target, pose: T
                   near: bool) -> list[tuple[int, SmearStart]]:
     """Return the places at which prints that face the camera resemble the image."""
     found = ((k, seek(image, camera, sought.smears[k], pose, near))
-             for k in np.flatnonzero(facing(sought.model, pose)).tolist())
+             for k, turned in enumerate(facing(sought.model, pose)) if turned)
     return [(k, start) for k, start in found if start is not None]
 
 
 def _fit_as_before(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
                    last: Measurement) -> _Whole | None:
     """Return the fit to a single marker whose print is smeared as in the last image, or None."""
-    if last.smear is None or not facing(sought.model, pose).all():
+    if last.smear is None or not all(facing(sought.model, pose)):
         return None
     found = descend(image, camera, sought.smears[0], SmearStart(pose, last.smear, last.lens), True,
                     AS_BEFORE_STEPS)
@@ -420,14 +425,14 @@ def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measureme
         smear=found.smear, lens=found.lens)
 
 
-def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
-    """Return which of the fitted markers show their codes, (m,)."""
+def _find_shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> tuple[bool, ...]:
+    """Return for each of the fitted markers whether it shows its code."""
     lines, model = found.lines, found.lines.model
     # More edges would be out of place if one of the markers had the code of any other.
     clear = tracked and found.rms < SHARP_RMS and (
         (1.0 - found.inlier_share) * len(model) < 0.5 * model.distinct)
-    return np.array([clear or shows_code(image, lines.cells[part], code, tracked)
-                     for part, code in zip(model.cell_slices, model.codes)])
+    return tuple(clear or shows_code(image, lines.cells[part], code, tracked)
+                 for part, code in zip(model.cell_slices, model.codes))
 
 
 def _scale(found: EdgeFit) -> float:

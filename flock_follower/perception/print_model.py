@@ -306,7 +306,7 @@ class EdgeModel:
         self.marker, self.centers, self.facings, self.codes = marker, centers, facings, codes
         # Which edges are across either axis, (2, n); how many, (2,); one of each axis.
         self.across = np.array([[0], [1]]) == axis
-        self.counts = self.across.sum(axis=1).astype(float)
+        self.counts = self.across.sum(axis=1).tolist()
         self.examples = int(axis.argmin()), int(axis.argmax())
         # The narrowest room across either, m.
         first, second = (float(room[one].min(initial=np.inf)) for one in self.across)
@@ -322,27 +322,27 @@ class EdgeModel:
         # The cells of each marker, among all of them.
         self.cell_slices = [slice(*ends) for ends in pairwise(
             np.cumsum([0, *(len(code.centers) for code in codes)]).tolist())]
-        self._parts: dict[bytes, EdgeModel] = {}
+        self._parts: dict[tuple[bool, ...], EdgeModel] = {}
 
     def __len__(self) -> int:
         """Return the number of edge points."""
         return len(self.tangents)
 
-    def only(self, markers: Any) -> EdgeModel:
-        """Return the model of the chosen markers (m,), bool; their order is kept."""
-        if markers.all():
+    def only(self, markers: tuple[bool, ...]) -> EdgeModel:
+        """Return the model of the chosen ones of the m markers; their order is kept."""
+        if all(markers):
             return self
-        key = markers.tobytes()
-        if key not in self._parts:
-            edges = markers[self.marker]
-            cells = np.repeat(markers, [len(code.centers) for code in self.codes])
-            renumbered = np.cumsum(markers) - 1
-            self._parts[key] = EdgeModel(
+        if markers not in self._parts:
+            chosen = np.array(markers)
+            edges = chosen[self.marker]
+            cells = np.repeat(chosen, [len(code.centers) for code in self.codes])
+            renumbered = np.cumsum(chosen) - 1
+            self._parts[markers] = EdgeModel(
                 self.places[np.concatenate([edges, cells])], self.tangents[edges],
                 self.axis[edges], self.room[edges], renumbered[self.marker[edges]],
-                self.centers[markers], self.facings[markers],
+                self.centers[chosen], self.facings[chosen],
                 tuple(c for c, m in zip(self.codes, markers) if m))
-        return self._parts[key]
+        return self._parts[markers]
 
 
 @lru_cache(maxsize=64)

@@ -227,13 +227,12 @@ def _basis(pose: Transform, model: SmearModel) -> Array:
 
 def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) -> _Seen | None:
     """Return the brightness at places (3, s) on a marker; None if too few are in the image."""
-    points = basis.dot(places).T
-    if not np.minimum.reduce(points[:, 2]) > _MIN_DEPTH:
+    points = basis.dot(places)
+    if not np.minimum.reduce(points[2]) > _MIN_DEPTH:
         return None
-    pixels = camera.project(points)
-    xy = pixels.T.copy()
+    pixels = camera.distort((points[:2] / points[2]).T)
     (left, top), (right, bottom) = (
-        end.reduce(xy, axis=1).tolist() for end in (np.minimum, np.maximum))
+        end.reduce(pixels).tolist() for end in (np.minimum, np.maximum))
     inside: Any = None
     # Written so that NaN is outside.
     if not (left >= 0.0 and top >= 0.0 and right <= camera.width - 1
@@ -243,8 +242,8 @@ def _look(image: GrayImage, camera: CameraModel, basis: Array, places: Array) ->
         inside = ((pixels >= 0.0) & (pixels <= (camera.width - 1, camera.height - 1))).all(axis=1)
         if np.count_nonzero(inside) < _MIN_INSIDE * len(inside):
             return None
-    brightness = cv2.remap(image, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR,
-                           borderMode=cv2.BORDER_REPLICATE).ravel()
+    x, y = pixels.T.astype(np.float32)
+    brightness = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
     return _Seen(brightness.astype(float), inside)
 
 

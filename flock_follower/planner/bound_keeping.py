@@ -35,8 +35,14 @@ from flock_follower.planner.limits import (
     LimitedCommand,
     SENT_INSIDE,
 )
-from flock_follower.planner.projection import Discs, LENGTH_TOLERANCE, nearest_in_order, product
-from flock_follower.planner.vectors import scalar_product
+from flock_follower.planner.projection import (
+    Discs,
+    LENGTH_TOLERANCE,
+    nearest_in_order,
+    product,
+    Side,
+)
+from flock_follower.planner.vectors import scalar_product, ZERO_VECTOR
 
 # Reasons of bounds. Separation and cohesion are the guard's edges of the band; the law's terms of
 # the same names are in ``flocking``.
@@ -80,26 +86,29 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     :param drag: acceleration (3,), m/s^2, that drag takes. With it, ``v_max`` is approached within
         ``SPEED_TIME``; if None, within one period.
     """
-    v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
-    if not math.hypot(*v.tolist()) < SANE:  # NaN fails
-        return limit_command([*nominal[:2], vertical], v, a_max, v_max, period)
+    v, requested = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float).tolist()
+    vx, vy, vz = v.tolist()
+    speed = math.hypot(vx, vy, vz)
+    if not speed < SANE:  # NaN fails
+        return limit_command([*requested[:2], vertical], v, a_max, v_max, period)
     strongest = math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0))
-    horizontal = limit_norm(nominal[:2], strongest)
-    reasons = [] if horizontal.tolist() == nominal[:2].tolist() else ['a_max']
-    rising = max(abs(float(v[2]) + vertical * period), abs(climb))
+    ax, ay = limit_norm(requested[:2], strongest).tolist()
+    reasons = [] if [ax, ay] == requested[:2] else ['a_max']
+    rising = max(abs(vz + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
     # Above v_max already: the speed falls within SPEED_TIME, and does not grow in this period.
-    most = v_max if drag is None else max(v_max, math.hypot(*v.tolist()) * INSIDE_SHARE)
-    left = math.sqrt(max(most ** 2 - float(v[2] + vertical * period) ** 2, 0.0))
-    for limit, time, lost in [(fastest, period, np.zeros(2))] if drag is None else [
-            (fastest, max(SPEED_TIME, period), np.asarray(drag)[:2]),
-            (left, period, np.zeros(2))]:
-        reached = v[:2] + (horizontal - lost) * time
-        target = limit_norm(reached, limit)
-        if target.tolist() != reached.tolist():
-            horizontal = limit_norm((target - v[:2]) / time + lost, strongest)
+    most = v_max if drag is None else max(v_max, speed * INSIDE_SHARE)
+    left = math.sqrt(max(most ** 2 - (vz + vertical * period) ** 2, 0.0))
+    for limit, time, (lost_x, lost_y, _) in [(fastest, period, ZERO_VECTOR)] if drag is None else [
+            (fastest, max(SPEED_TIME, period), np.asarray(drag).tolist()),
+            (left, period, ZERO_VECTOR)]:
+        reached = [vx + (ax - lost_x) * time, vy + (ay - lost_y) * time]
+        target = limit_norm(reached, limit).tolist()
+        if target != reached:
+            ax, ay = limit_norm([(target[0] - vx) / time + lost_x,
+                                 (target[1] - vy) / time + lost_y], strongest).tolist()
             reasons.append('v_max')
-    command = limit_command([*horizontal.tolist(), vertical], v, a_max, most, period)
+    command = limit_command([ax, ay, vertical], v, a_max, most, period)
     binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
     reason = ', '.join(binding) if 'finite' not in command.reason else command.reason
     return LimitedCommand(command.acceleration, reason)
@@ -148,14 +157,21 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
     strongest = a_max * SENT_INSIDE
     left = math.sqrt(max(fastest ** 2 - (vz + vertical * period) ** 2, 0.0))
-    within, smooth = ((complex(*(lost - v[:2] / time)), left / time) for time, lost in (
-        (period, np.zeros(2)), (max(SPEED_TIME, period), np.asarray(drag)[:2])))
-    goal = complex(*limit_norm(a, SANE)[:2].tolist())
+    lost_x, lost_y, _ = np.asarray(drag).tolist()
+    slowly, goal = max(SPEED_TIME, period), complex(*limit_norm(a, SANE)[:2].tolist())
+    within = complex(0.0 - vx / period, 0.0 - vy / period), left / period
+    smooth = complex(lost_x - vx / slowly, lost_y - vy / slowly), left / slowly
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
-    cohesion = [k for k, side in enumerate(sides) if side[2] == COHESION]
-    if cohesion:
-        _yield_cohesion(goal, bounds, cohesion, Discs(*smooth, *smooth), discs)
-    point = nearest_in_order(goal, bounds, discs)
+    # Cohesion comes last in the order: the other bounds are firm.
+    firm = [bound for bound, side in zip(bounds, sides) if side[2] != COHESION]
+    point = nearest_in_order(goal, firm, discs)
+    if len(firm) < len(bounds):
+        by_speed = Discs(*smooth, *smooth)
+        reduced = [_reduce_cohesion(*bound, goal, point, firm, by_speed)
+                   for bound in bounds[len(firm):]]
+        bounds = [*firm, *reduced]
+        if any(product(normal, point) < least for normal, least in reduced):
+            point = nearest_in_order(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.
     acting = [k for k, (normal, least) in enumerate(bounds)
@@ -166,29 +182,24 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
 
 
-def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]], cohesion: Sequence[int],
-                    by_speed: Discs, discs: Discs) -> None:
+def _reduce_cohesion(normal: complex, least: float, goal: complex, start: complex,
+              firm: Sequence[Side], by_speed: Discs) -> Side:
     """
-    Reduce the cohesion bounds, first by ``COHESION_INSISTENCE``: see ``keep_bounds``.
+    Return a cohesion bound, reduced first by ``COHESION_INSISTENCE``: see ``keep_bounds``.
 
     Then to the motion towards the neighbor that firm bounds leave: against an opposite firm bound
     only a motion across would still bring the vehicle a little nearer, as hard as it can.
 
-    :param cohesion: indices of the cohesion bounds; the other bounds are firm.
-    :param by_speed: limits by the speed alone; :param discs: all limits.
+    :param start: the nearest command to ``goal`` that keeps the firm bounds.
+    :param by_speed: limits by the speed alone.
     """
-    for k in cohesion:
-        normal, least = bounds[k]
-        correction = COHESION_INSISTENCE * (least - product(normal, goal))
-        if correction > 0.0:
-            step = min(correction, SANE) / abs(normal) ** 2
-            bounds[k] = normal, min(least, product(normal, by_speed.best(goal + step * normal)))
-    firm = [each for k, each in enumerate(bounds) if k not in cohesion]
-    start = nearest_in_order(goal, firm, discs)
-    for k in cohesion:
-        normal, least = bounds[k]
-        if product(normal, start) < least:
-            room = min((max(product(other, start) - bound, 0.0) / -product(other, normal)
-                        for other, bound in firm if product(other, normal) < 0.0),
-                       default=math.inf)
-            bounds[k] = normal, min(least, product(normal, start) + room * abs(normal) ** 2)
+    correction = COHESION_INSISTENCE * (least - product(normal, goal))
+    if correction > 0.0:
+        step = min(correction, SANE) / abs(normal) ** 2
+        least = min(least, product(normal, by_speed.best(goal + step * normal)))
+    if product(normal, start) < least:
+        room = min((max(product(other, start) - bound, 0.0) / -product(other, normal)
+                    for other, bound in firm if product(other, normal) < 0.0),
+                   default=math.inf)
+        least = min(least, product(normal, start) + room * abs(normal) ** 2)
+    return normal, least

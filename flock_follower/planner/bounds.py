@@ -78,7 +78,13 @@ from flock_follower.planner.params import (
     PlannerParams,
 )
 from flock_follower.planner.sight import FieldsOfView, IMAGE_MARGIN, vertical
-from flock_follower.planner.vectors import difference, horizontal, opposite, scalar_product
+from flock_follower.planner.vectors import (
+    difference,
+    horizontal,
+    opposite,
+    scalar_product,
+    ZERO_VECTOR,
+)
 from flock_follower.planner.vertical_yaw import OVERHEAD_DISTANCE
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
@@ -95,7 +101,6 @@ MARKER_ANGLE = math.radians(60.0)  # largest angle between a marker's normal and
 COLUMN_ANGLE = math.radians(30.0)  # largest angle to the marker's normal behind a follower
 MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each meter of arc that is left
 MARKER_SHARE = 0.3  # of v_max: speed with which an angle beyond the largest is reduced
-ZERO_VECTOR = 0.0, 0.0, 0.0  # m/s, or m/s^2
 
 
 def radial_bounds(offset: Sequence[float], relative_velocity: Sequence[float], edges: Edges,

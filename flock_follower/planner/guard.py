@@ -47,7 +47,6 @@ from flock_follower.planner.bounds import (
     sight_bounds,
     stop,
     STOP_SHARE,
-    ZERO_VECTOR,
 )
 from flock_follower.planner.inputs import (
     MAX_ACCELERATION_AGE,
@@ -63,7 +62,7 @@ from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.retreat import APPROACH_NOISE, retreat
 from flock_follower.planner.scene import RECEIVED_SIGMAS, Scene, silent
 from flock_follower.planner.sight import FieldsOfView
-from flock_follower.planner.vectors import difference
+from flock_follower.planner.vectors import difference, ZERO_VECTOR
 
 HORIZONTAL_AXES = np.array([1.0, 1.0, 0.0])  # factors of x, y, z
 

@@ -75,19 +75,21 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     in_sight = youngest is not None and youngest <= params.predict_timeout
     heard = received is not None and received <= params.heard_timeout
     rules = (  # the first that applies counts
-        (not engaged, State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'),
+        (not engaged, State.IDLE, 'not engaged: {waiting}' if waiting else 'not engaged'),
         (given_up, State.IDLE if waiting else lost,
-         f'no neighbor followed for more than {params.resume_timeout:g} s: sends no more '
-         f'commands, call planner/engage to follow again{f" ({fault})" if fault else ""}'),
-        (bool(waiting), State.IDLE, f'engaged, waiting for {waiting}'),
-        (bool(fault), lost, fault),
+         'no neighbor followed for more than {longest:g} s: sends no more commands, call '
+         f'planner/engage to follow again{" ({fault})" if fault else ""}'),
+        (waiting, State.IDLE, 'engaged, waiting for {waiting}'),
+        (fault, lost, '{fault}'),
         (in_sight, State.TRACK, ''),
         (heard, State.TRACK, 'no neighbor in sight: follows received states'),
         (followed is None, State.SEARCH, 'no neighbor seen since engaging'),
-        (occluded, State.HOLD, f'neighbor occluded, seen {unseen:.1f} s ago'),
-        (unseen <= params.coast_timeout, State.COAST, f'no neighbor seen for {unseen:.1f} s'),
-        (True, State.HOLD, f'no neighbor seen for {unseen:.1f} s'))
-    return next((state, reason) for applies, state, reason in rules if applies)
+        (occluded, State.HOLD, 'neighbor occluded, seen {unseen:.1f} s ago'),
+        (unseen <= params.coast_timeout, State.COAST, 'no neighbor seen for {unseen:.1f} s'),
+        (True, State.HOLD, 'no neighbor seen for {unseen:.1f} s'))
+    state, reason = next((state, reason) for applies, state, reason in rules if applies)
+    return state, reason.format(
+        waiting=waiting, longest=params.resume_timeout, fault=fault, unseen=unseen)
 
 
 def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> str:

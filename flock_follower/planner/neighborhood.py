@@ -57,6 +57,8 @@ class Neighborhood(NamedTuple):
     flock: Sequence[Neighbor]
     positions: Array
     """Positions of the flock (n, 3), m."""
+    velocities: Array
+    """Velocities of the flock (n, 3), m/s."""
     distances: Array
     """Distances between the centers (n,), m."""
     radii: Array
@@ -77,7 +79,7 @@ class Neighborhood(NamedTuple):
 
 
 NOBODY = Neighborhood(
-    (), np.zeros((0, 3)), np.zeros(0), np.zeros(0), {}, frozenset(), None, None)
+    (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), {}, frozenset(), None, None)
 
 
 def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
@@ -86,11 +88,12 @@ def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
     Return the relations of the present neighbors to this vehicle.
 
     :param memory: has the relations of the previous step, ``elapsed`` seconds ago.
-    :param flock: all present neighbors, at one time; at least one of them can be followed.
+    :param flock: all present neighbors; at least one of them can be followed.
     """
-    here, positions = me.position.tolist(), np.array([n.position for n in flock])
-    distances = [math.dist(there, here) for there in positions.tolist()]
-    around = (flock, positions, np.array(distances),
+    here, places = me.position.tolist(), [_place_at(me.stamp, n) for n in flock]
+    positions, distances = np.array(places), [math.dist(there, here) for there in places]
+    flock = [n._replace(stamp=me.stamp, position=there) for n, there in zip(flock, positions)]
+    around = (flock, positions, np.array([n.velocity for n in flock]), np.array(distances),
               np.array([params.radius + n.member.radius for n in flock]))
     if len(flock) == 1:  # most often; one to avoid is never the only neighbor
         only = flock[0]
@@ -115,6 +118,12 @@ def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
     return Neighborhood(*around, shares, joined, faced, level)
 
 
+def _place_at(time: float, n: Neighbor) -> list[float]:
+    """Return the position (3,), m, of a neighbor at a time, s, with constant velocity."""
+    age, (x, y, z), (vx, vy, vz) = time - n.stamp, n.position.tolist(), n.velocity.tolist()
+    return [x + age * vx, y + age * vy, z + age * vz]
+
+
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
           params: PlannerParams) -> frozenset[str]:
     """
@@ -126,9 +135,9 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     if len(follow) < 2:
         return frozenset(n.name for n in follow)
     joined = neighbor_graph.edges(
-        me.position, np.array([n.position for n in follow]),
-        np.array([params.radius + n.member.radius for n in follow]), params.radius,
-        np.array([n.name in held for n in follow]))
+        me.position.tolist(), [n.position.tolist() for n in follow],
+        [params.radius + n.member.radius for n in follow], params.radius,
+        [n.name in held for n in follow])
     seen = [n for n in follow if not n.received]
     # A received position never removes the edge to the only leader in sight. Beyond the band such
     # an edge does not begin beside others: it would pull past the vehicle between.
@@ -136,7 +145,7 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
         not held or n.name in held
         or max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0) ** 2
         < params.law.d1)]
-    return frozenset(n.name for n, edge in zip(follow, joined.tolist()) if edge or n.name in kept)
+    return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 
 def _find_nearest(distances: Mapping[str, float], held: str,
@@ -214,7 +223,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     # From the ego hull to those of the neighbors.
     shortened = np.maximum(distances - neighbors.radii, GAP_MIN) / distances
     offsets = (neighbors.positions - me.position) * shortened[:, None]
-    differences = np.array([n.velocity for n in flock]) - me.velocity
+    differences = neighbors.velocities - me.velocity
     if len(flock) == 1:
         law = params.law.command(offsets, differences)
     else:

@@ -37,7 +37,6 @@ from flock_follower.planner.inputs import (
     OwnState,
     predict,
     Prediction,
-    propagate,
     Rejection,
     TRUSTED_TIME,
 )
@@ -107,8 +106,8 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
     """Return the memory with all neighbors to keep clear of, and the scene after ``elapsed`` s."""
     neighbors, leader = NOBODY, None
     if state is State.TRACK:
-        here = [propagate(n, me.stamp) for n in memory.neighbors.values()]
-        neighbors = build_neighborhood(memory, me, here, params, elapsed)
+        neighbors = build_neighborhood(
+            memory, me, [*memory.neighbors.values()], params, elapsed)
         leader = lost_leader(memory, neighbors, me, params)
     flock = _flock(memory, me.stamp, state, leader, params)
     missed = leader

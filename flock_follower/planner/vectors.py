@@ -23,6 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+ZERO_VECTOR = 0.0, 0.0, 0.0
+
 
 def scalar_product(one: Sequence[float], other: Sequence[float]) -> float:
     """Return the scalar product of two vectors (3,)."""

@@ -159,6 +159,12 @@ FAULTS: list[Fault] = [
     Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'in either frame',
           'derived from the positions',
           columns(slice(9, 12), [1.5, 1.5, 0.0])),
+    Fault('a velocity that is never valid', BOTH, WARNING, 'odom velocity', 'none (not finite)',
+          'derived from the positions', columns(slice(9, 12), [math.nan] * 3)),
+    Fault('a velocity that is invalid for moments', BOTH, WARNING, 'odom velocity',
+          'invalid 2 times', 'derived from the positions', lambda seen: [
+              row.__setitem__(slice(9, 12), [math.nan] * 3)
+              for row in (seen.rows[50], *seen.rows[120:125])]),
     Fault('a source that is lost', BOTH, ERROR, 'odom', '250 of 250 are invalid: quaternion = 0',
           'publish_null_when_lost',
           columns(slice(5, 9), [0.0] * 4)),

@@ -27,8 +27,10 @@ from flock_follower.gate.velocity_check import (
     DISPLACEMENT_WINDOW,
     find_displacement,
     finite_vector,
+    fresh,
     known_motion,
     LATCH_TIME,
+    MotionReport,
     ODOM,
     Path,
     plausible_velocity,
@@ -38,7 +40,7 @@ from flock_follower.gate.velocity_check import (
     YAW_MEMORY,
 )
 from flock_follower.geometry import Array
-from flock_follower.messages import FASTEST_OWN
+from flock_follower.messages import FASTEST_OWN, FUTURE_TOLERANCE, OdometryState, SANE
 
 LIMITS = GateLimits()
 SLOW = SourceMotion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
@@ -65,6 +67,27 @@ def test_what_is_not_three_finite_numbers_is_no_vector(value):
     (FASTEST_OWN, True), (math.nextafter(FASTEST_OWN, math.inf), False)])
 def test_a_velocity_is_plausible_up_to_the_fastest(speed: float, known: bool) -> None:
     assert (plausible_velocity((0.0, -speed, 0.0)) is not None) == known
+
+
+@pytest.mark.parametrize(('age', 'usable'), [
+    (0.0, True), (0.3, True), (0.301, False), (-FUTURE_TOLERANCE, True),
+    (-FUTURE_TOLERANCE - 0.001, False), (math.inf, False), (-math.inf, False), (math.nan, False)])
+def test_what_is_old_or_from_the_future_is_not_fresh(age: float, usable: bool) -> None:
+    assert fresh(age, 0.3) == usable
+
+
+@pytest.mark.parametrize(('variance', 'std'), [(0.01, 0.3), (-0.01, 0.0)])
+def test_a_report_of_odometry_has_the_deviation_of_its_place(variance: float, std: float) -> None:
+    covariance = np.diag([2.0, 3.0, 4.0, 100.0, 100.0, 100.0]) * variance
+    state = OdometryState(0, 'odom', 'base_link', np.array([1.0, 2.0, 3.0]),
+                          np.array([0.0, 0.0, math.sin(0.2), math.cos(0.2)]),
+                          np.array([4.0, 5.0, 6.0]), np.zeros(3), covariance, 9.0 * covariance,
+                          np.eye(3))
+    report = MotionReport.from_odometry(state)
+    assert report.std == pytest.approx(std) and report.yaw == pytest.approx(0.4)
+    assert np.array_equal(report.velocity, (4.0, 5.0, 6.0))
+    assert np.array_equal(report.position, (1.0, 2.0, 3.0))  # type: ignore[arg-type]
+    assert MotionReport((4.0, 5.0, 6.0)).std == 0.0
 
 
 # Two sources that may disagree.
@@ -227,6 +250,19 @@ def test_a_displacement_within_the_window_follows_a_curve() -> None:
             path.displacement(first, last), curve(last) - curve(first), atol=0.005)
 
 
+def test_a_path_keeps_the_window_in_tenths_of_a_second() -> None:
+    path = Path()
+    for now, newest in ((0.0, 0.0), (0.04, 0.0), (0.09, 0.0), (0.1, 0.1), (0.19, 0.1)):
+        path.take(np.array([now, 0.0, 0.0]), None, now)
+        assert path.span == (0.0, newest)
+    path.take(np.array([9.0, 0.0, 0.0]), None, 0.15)  # older than the newest
+    assert path.time == 0.19 and path.position is not None and path.position[0] == 0.19
+    for step in range(2, 81):
+        path.take(np.zeros(3), None, 0.1 * step)
+    start, end = path.span
+    assert end - DISPLACEMENT_WINDOW - 0.15 < start <= end - DISPLACEMENT_WINDOW
+
+
 @pytest.mark.parametrize(('change', 'largest'), [(0.0, 6.3), (-1.5, 9.3)])
 @pytest.mark.parametrize('off', [-0.01, 0.01])
 def test_motion_that_explains_a_step_in_a_gap_is_no_jump(
@@ -243,7 +279,7 @@ def test_a_position_beyond_a_sane_one_changes_nothing() -> None:
     source = Source()
     for position, std, expected, kept in (
             ((1.0, 2.0, 3.0), 0.5, (1.0, 2.0, 3.0), 0.5),
-            ((1.1e6, 2.0, 3.0), 0.7, (1.0, 2.0, 3.0), 0.5),
+            ((-SANE, 2.0, 3.0), 0.7, (1.0, 2.0, 3.0), 0.5),
             ((math.nan, 2.0, 3.0), 0.7, (1.0, 2.0, 3.0), 0.5),
             ((1.0, 2.0, 3.1), math.nan, (1.0, 2.0, 3.1), 0.0)):
         source.take_position(position, 1.0, std, 0.3)
@@ -300,11 +336,12 @@ def test_yaw_nearest_to_time_is_returned_old_ones_forgotten():
     source = Source()
     assert source.yaw(1.0) == source.yaw() == (0.0, -math.inf)
     for step in range(31):
-        source.take_yaw(0.1 * step, 0.1 * step)
+        source.take_yaw(0.1 * step - 2.5, 0.1 * step)
     for refused, time in ((1.0, 2.95), (math.nan, 3.1)):  # out of order, not finite
         source.take_yaw(refused, time)
-    assert source.yaw() == pytest.approx((3.0, 3.0))
-    assert source.yaw(2.52) == pytest.approx((2.5, 2.5))
-    assert source.yaw(0.0) == pytest.approx((3.0 - YAW_MEMORY, 3.0 - YAW_MEMORY))
-    source.take_yaw(3.0 + math.pi, 3.0)  # of the same time: the later report, wrapped
-    assert source.yaw() == pytest.approx((3.0 - math.pi, 3.0))
+    assert source.yaw() == pytest.approx((0.5, 3.0))
+    for time, nearest in ((2.52, 2.5), (2.58, 2.6), (2.04, 2.0), (0.0, 3.0 - YAW_MEMORY)):
+        assert source.yaw(time) == pytest.approx((nearest - 2.5, nearest))
+    kept = len(source.yaws)
+    source.take_yaw(0.5 + math.pi, 3.0)  # of the same time: the later report, wrapped
+    assert source.yaw() == pytest.approx((0.5 - math.pi, 3.0)) and len(source.yaws) == kept

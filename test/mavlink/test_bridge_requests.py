@@ -16,7 +16,7 @@
 
 import math
 
-from bridge_flight import Flight, NO_GPS
+from bridge_flight import BOTH, Flight, NO_GPS
 from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -132,6 +132,22 @@ def test_a_request_ends_with_the_permission_and_its_reason():
     flight.autopilot.reboot(flight.now, 0.2)
     flight.fly(0.5)
     assert request.outcome == (False, 'offboard refused: disarmed')
+
+
+@BOTH
+@pytest.mark.parametrize(('abort', 'arguments'), [('land', []), ('offboard', [False])])
+@pytest.mark.parametrize('kind', ['drop', 'delay'])
+def test_pilot_who_switches_after_a_request_keeps_the_mode(personality, abort, arguments, kind):
+    """Nothing that the autopilot sends arrives, or all of it arrives together, too late."""
+    flight = Flight(personality).follow(1.0)
+    begun = flight.now
+    silent = [Fault(kind, begun + at, 0.05, 'sent', by=2.5 - at) for at in np.arange(0, 2.5, 0.05)]
+    flight.autopilot._sent._faults += silent
+    getattr(flight.bridge.requests, abort)(*arguments, flight.now)
+    flight.fly(0.5)
+    flight.controller.pilot_switches(flight.modes.manual)
+    flight.fly(5.0)
+    assert flight.mode == flight.modes.manual
 
 
 @pytest.mark.parametrize(('options', 'reported'), [

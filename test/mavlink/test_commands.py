@@ -142,22 +142,28 @@ def test_what_is_sent_and_how_often():
 @pytest.mark.parametrize(('goal', 'script', 'modes', 'reason'), [
     # Accepted, and perhaps reached: no other mode is requested of a vehicle that is not received.
     (commands.hold, [(0.0, OFFBOARD, ACCEPTED), *((t, None) for t in (2.0, 3.6, 5.0))],
-     ['AUTO.LOITER', 'AUTO.LOITER'], 'hold not reached within 3.5 s: no HEARTBEAT comes'),
+     ['AUTO.LOITER'], 'hold not reached within 3.5 s: no HEARTBEAT comes'),
     (commands.hold, [(0.0, OFFBOARD, REJECTED), (0.6, None), (1.2, None)],
      ['AUTO.LOITER'], 'hold refused: temporarily rejected'),
     # A pilot has taken over meanwhile.
     (climb, [(0.0, shows('AUTO.TAKEOFF'), ACCEPTED), (16.8, None), (16.9, None),
              (18.0, shows('POSCTL')), (19.0, shows('POSCTL'))],
-     ['AUTO.LAND'], 'takeoff refused: the mode was changed to POSCTL meanwhile')])
+     [], 'takeoff refused: the mode was changed to POSCTL meanwhile')])
 def test_no_mode_is_requested_against_what_was_not_received(goal, script, modes, reason):
     request, sent = play(goal, script)
     assert [request.current.modes[0] for _, command, _ in sent if command == SET_MODE] == modes
     assert not request.outcome.success and request.outcome.message.endswith(reason)
 
 
+def test_next_mode_is_not_requested_once_vehicle_is_lost():
+    script = [(0.0, OFFBOARD, ACCEPTED, REJECTED), (0.6, OFFBOARD), (0.7, None), (4.0, None)]
+    request, sent = play(commands.hold, script)
+    assert len(sent) == 1 and not request.outcome.success
+
+
 def test_reports_before_the_command_do_not_count():
     request = Request(PX4, commands.land(PX4), 0.0)
-    for now, shown, sent in ((0.0, -0.1, 0), (0.3, -0.1, None), (0.6, 0.5, None)):
+    for now, shown, sent in ((0.0, -0.1, 0), (0.4, -0.1, None), (0.6, 0.5, None)):
         assert request.outcome is None
         assert request.step(Vehicle(shows('AUTO.LAND'), None, shown), streaming_for=0.0,
                             texts=StatusTexts(), now=now) == sent
@@ -165,6 +171,43 @@ def test_reports_before_the_command_do_not_count():
     # Nor does a mode that a request under way is about to change.
     hold = Request(PX4, commands.hold(PX4), 0.0, superseded=commands.offboard(PX4))
     assert hold.step(Vehicle(HOLD), streaming_for=0.0, texts=StatusTexts(), now=0.0) == 0
+
+
+def reported(request, script):
+    """Return the times, s, at which commands are sent; an entry is a time and a report's mode."""
+    sent, newest = [], (-1.0, 'POSCTL')
+    for tenth in range(round(10 * script[-1][0]) + 1):
+        now = tenth / 10
+        for time, *modes in script:
+            if time == now:
+                for mode in modes:
+                    request.observe(mode)
+                newest = (now + 0.01, modes[-1]) if modes else newest
+        vehicle = Vehicle(shows(newest[1]), None, newest[0])
+        if request.step(vehicle, streaming_for=0.0, texts=StatusTexts(), now=now) is not None:
+            sent.append(now)
+    return sent
+
+
+def test_a_command_is_sent_again_only_at_a_new_report():
+    """A pilot may have switched since an older one."""
+    request = Request(PX4, commands.land(PX4), 0.0)
+    assert reported(request, [(0.0, 'POSCTL'), (0.9, 'POSCTL'), (1.6, 'POSCTL'), (2.4, 'POSCTL'),
+                              (2.7, 'POSCTL'), (3.4,)]) == [0.0, 1.0, 2.4]
+
+
+@pytest.mark.parametrize('modes', [('AUTO.LAND', 'POSCTL'), ('POSCTL', 'OFFBOARD', 'POSCTL')])
+def test_mode_that_was_left_and_is_back_is_the_pilots(modes):
+    """Reports that were held up arrive together; the pilot's mode is the one at the beginning."""
+    request = Request(PX4, commands.land(PX4), 0.0, superseded=commands.offboard(PX4))
+    assert reported(request, [(0.0, 'POSCTL'), (0.9, *modes), (3.0,)]) == [0.0]
+    assert request.outcome.message.endswith('the mode was changed to POSCTL meanwhile')
+
+
+@pytest.mark.parametrize(('mode', 'times'), [('POSCTL', 1), ('OFFBOARD', 4)])
+def test_accepted_command_is_repeated_against_setpoints_only(mode, times):
+    _, sent = play(commands.land, every(shows(mode), 3.4, ACCEPTED))
+    assert len(sent) == times
 
 
 def test_acks_of_other_commands_are_not_taken():

@@ -26,6 +26,7 @@ from flock_follower.gate.height import (
     HeightEstimator,
     MAX_CORRECTION,
     pressure_altitude,
+    RateSteps,
     STEP_PAUSE,
 )
 from flock_follower.gate.obstacle import Obstacle
@@ -55,6 +56,27 @@ def test_pressures_are_altitudes_of_the_standard_atmosphere():
 def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():
     heights, found = flown(3600.0)
     assert np.std(found[100:]) < 0.03 and heights.stepped == -math.inf
+
+
+@pytest.mark.parametrize(('elapsed', 'difference', 'altitude', 'rate'), [
+    (0.05, 0.1, 0.01, 0.005), (0.1, -0.4, -0.08, -0.04), (0.6, 0.3, 0.3, 0.18),
+    (0.05, 30.0, 3.0, 0.025), (0.05, -30.0, -3.0, -0.025), (HEIGHT_TIMEOUT, 0.2, 0.2, 0.2),
+    (HEIGHT_TIMEOUT + 0.01, 0.2, 0.2, 0.0)])  # it begins again
+def test_sensor_alone_is_followed_by_its_bandwidth(elapsed, difference, altitude, rate):
+    heights = HeightEstimator()
+    heights.take(100.0, None, 0.0)
+    heights.take(100.0 + difference, None, elapsed)
+    assert heights.altitude(elapsed) == pytest.approx(100.0 + altitude)
+    assert heights.climb_rate == pytest.approx(rate)
+    assert heights.altitude(elapsed + 0.5) == pytest.approx(100.0 + altitude + 0.5 * rate)
+
+
+def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
+    heights, found = HeightEstimator(), []
+    for k, altitude in enumerate((90.0, 90.5, 90.0, 90.51, 90.51)):
+        heights.take(altitude, 0.0, 0.1 * k)
+        found.append(heights.leapt)
+    assert found == pytest.approx([-math.inf, -math.inf, -math.inf, 0.3, 0.3])
 
 
 @pytest.mark.parametrize(('seconds', 'before', 'error'), [(8.0, 1.0, 0.3), (2.0, 0.59, 0.0)])
@@ -201,6 +223,33 @@ def test_climb_that_setpoints_explain_is_no_error_of_its_source():
         heights.take(100.0 + max(k - 45, 0) * PERIOD * rate, rate, k * PERIOD,
                      acceleration=acceleration)
     assert heights.correct(rate, 99 * PERIOD) == pytest.approx(rate, abs=0.05)
+
+
+@pytest.mark.parametrize(('changes', 'elapsed', 'acceleration', 'step'), [
+    ([0.2] * 20, 0.05, None, 0.0),  # 4 m/s^2: what a vehicle can
+    ([0.8], 0.05, None, 0.6), ([-0.8], 0.05, None, -0.6),
+    ([0.5], 0.05, 0.0, 0.0), ([0.51], 0.05, 0.0, 0.51), ([-0.51], 0.05, 0.0, -0.51),
+    ([0.6], 0.1, 1.5, 0.0), ([0.7], 0.1, 1.5, 0.55), ([-0.6], 0.1, 1.5, -0.6),
+    # It does not obey.
+    ([0.0] * 20, 0.1, 2.0, 0.0), ([0.1] * 8, 0.1, 9.0, 0.0), ([0.3], 0.1, -9.0, 0.0),
+    ([0.55], 0.1, -9.0, 0.55),
+    # Forgotten within a second.
+    ([0.4, 0.4], 0.1, 0.0, 0.4 + 0.4 * math.exp(-0.1)), ([0.3] * 20, 1.0, 0.0, 0.0),
+    ([0.4, 0.4], 1.0, 0.0, 0.4 + 0.4 * math.exp(-1.0)), ([0.4, 0.4], 2.0, 0.0, 0.0),
+    # A step counts once.
+    ([0.6, 0.4], 0.1, 0.0, 0.6), ([0.6, 0.6], 0.1, 0.0, 1.2), ([0.6, -0.6], 0.1, 0.0, 0.0)])
+def test_change_no_vehicle_makes_is_a_step_of_its_source(changes, elapsed, acceleration, step):
+    steps = RateSteps()
+    found = [steps.take(change, elapsed, acceleration, 0.0) for change in changes]
+    assert math.fsum(found) == pytest.approx(step)
+
+
+def test_source_is_suspected_before_its_change_is_a_step():
+    steps, found = RateSteps(), []
+    for k, change in enumerate((0.3, -0.3, 0.32, 0.0, 0.0, -0.62)):
+        steps.take(change, 0.05, 0.0, float(k))
+        found.append(steps.suspected)
+    assert found == [-math.inf, -math.inf, 2.0, 2.0, 2.0, 5.0]
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)

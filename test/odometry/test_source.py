@@ -252,6 +252,23 @@ def test_velocity_with_absurd_variance_is_not_used() -> None:
     assert 'velocity' in source.missing
 
 
+@pytest.mark.parametrize('velocity', [np.nan, 200.0])
+def test_invalid_velocity_is_counted_until_one_is_valid(velocity: float) -> None:
+    source = OdometrySource()
+    read(source, Source(), 3.0)
+    for k in range(300, 330):
+        t, invalid = 0.01 * k, k in (300, 310, 311, 312)
+        sent = message(t)
+        sent.twist.covariance = 1e-6 * np.eye(6).reshape(36)
+        if invalid:
+            set_vector(sent.twist.twist.linear, np.full(3, velocity))
+        state = taken(source, sent, t)
+        assert state.derived == invalid == ('velocity' in source.missing)
+        assert (state.velocity_covariance[0, 0] > 1e-4) == invalid  # not that of the message
+        assert np.linalg.norm(state.velocity - motion(t)[2]) < 0.05
+    assert [reason for reason, _ in source.new_events()] == 2 * ['odom velocity invalid']
+
+
 @pytest.mark.parametrize(('row', 'column', 'value', 'lacking'), [
     (0, 1, -50.0, 'linear'), (4, 3, 50.0, 'angular'), (0, 1, 0.99e-2, ''), (1, 4, 50.0, '')])
 def test_correlation_above_1_is_no_covariance(

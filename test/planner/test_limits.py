@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from flown import assert_within_limits
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -47,12 +47,24 @@ LIMIT = st.floats(0.01, 100.0)
 PERIOD = st.floats(0.01, 1.0)
 
 
-@given(ANYTHING, ANYTHING, LIMIT, LIMIT, PERIOD)
+@given(ANYTHING, ANYTHING, LIMIT, LIMIT, PERIOD, st.sampled_from([None, (0.0, 0.6, -0.8)]))
+@example((0.0, 1.0, 0.0), (1e308, 0.0, 0.0), 2.5, 0.5, 0.1, (0.0, 0.6, -0.8))
 def test_any_input_gives_a_finite_acceleration_within_a_max(
-        a: Vector, v: Vector, a_max: float, v_max: float, period: float) -> None:
-    command = limit_command(a, v, a_max, v_max, period)
+        a: Vector, v: Vector, a_max: float, v_max: float, period: float,
+        axis: Vector | None) -> None:
+    command = limit_command(a, v, a_max, v_max, period, None if axis is None else np.array(axis))
     assert np.all(np.isfinite(command.acceleration))
     assert np.linalg.norm(command.acceleration) <= a_max
+
+
+@pytest.mark.parametrize(('vector', 'limited'), [
+    ([1.7e308, -1.7e308], [1.5, -1.5]),  # longer than the largest number
+    ([1e200, 0.0], [1.5 * math.sqrt(2.0), 0.0]), ([1.0, 1.5], [1.0, 1.5]),
+    *(([wrong, other], [0.0, 0.0]) for wrong in (math.inf, math.nan) for other in (0, math.nan))])
+@pytest.mark.filterwarnings('error')
+def test_what_is_not_finite_counts_as_nothing_a_long_one_not(
+        vector: list[float], limited: list[float]) -> None:
+    assert limit_norm(vector, 1.5 * math.sqrt(2.0)) == pytest.approx(np.array(limited), rel=1e-9)
 
 
 @given(ANYTHING, FLYABLE, LIMIT, st.floats(0.0, 6.0), PERIOD)
@@ -103,6 +115,9 @@ def test_what_is_sent_in_single_precision_is_within_a_max_too(
     ([-1.0, 0, 0], [0.5, 0, 0], [-1.0, 0, 0], ''),
     ([0, 0, 0], [0, 0, 0.6], [0, 0, -1.0], 'v_max'),
     ([0, 0, 0], [0, -3.0, 0], [0, 2.5, 0], 'v_max'),
+    # It slows down, but not enough.
+    ([-0.5, 0, 0], [0.6, 0, 0], [-1.0, 0, 0], 'v_max'),
+    ([-0.05, 0, 0], [0.6, 0, 0], [-1.0, 0, 0], 'v_max'),
     ([math.nan, 0, 0], [0.1, 0, 0], [-1.0, 0, 0], 'acceleration not finite'),
     ([math.inf, 0, 0], [0, 0, 4.0], [0, 0, -2.5], 'acceleration not finite'),
     ([1.0, 0, 0], [0, math.nan, 0], [0, 0, 0], 'velocity not finite'),
@@ -196,3 +211,27 @@ def test_what_keeps_clear_of_a_neighbor_is_cut_last(seed: int) -> None:
                      & (np.linalg.norm(v + T * samples, axis=1) <= fastest)]
     kept = min(float(axis @ wanted), float((inside @ axis).max()))
     assert axis @ a >= kept - 1e-5 or axis @ wanted <= 0.0
+
+
+@given(st.integers(0, 2 ** 32))
+def test_across_axis_command_stays_as_near_as_limits_allow(seed: int) -> None:
+    """No sampled acceleration within the limits with the same part along ``axis`` is nearer."""
+    rng = np.random.default_rng(seed)
+    v, wanted, axis = rng.uniform(-0.5, 0.5, 3), rng.uniform(-4.0, 4.0, 3), rng.normal(size=3)
+    axis = axis / np.linalg.norm(axis)
+    if seed % 4 == 0:
+        v = rng.uniform(-1.5, 1.5) * axis
+    a = limit_command(wanted, v, A_MAX, V_MAX, T, axis).acceleration
+    plain = limit_command(wanted, v, A_MAX, V_MAX, T).acceleration
+    assert axis @ a >= axis @ plain  # less would be nearer to the neighbor
+    if axis @ a == axis @ plain or axis @ wanted <= 0.0:
+        assert np.array_equal(a, plain)
+        return
+    samples = np.vstack([rng.uniform(-A_MAX, A_MAX, (3000, 3)),
+                         a + 0.1 * rng.normal(size=(3000, 3))])
+    samples = samples + np.outer(axis @ a - samples @ axis, axis)
+    fastest = max(V_MAX, float(np.linalg.norm(v)))
+    inside = samples[(np.linalg.norm(samples, axis=1) <= A_MAX * SENT_INSIDE)
+                     & (np.linalg.norm(v + T * samples, axis=1) <= fastest)]
+    nearest = np.linalg.norm(inside - wanted, axis=1).min(initial=math.inf)
+    assert np.linalg.norm(a - wanted) <= nearest + 1e-5

@@ -107,7 +107,7 @@ def test_one_to_avoid_has_no_edge_and_removes_none() -> None:
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
     assert edges(set(), own(), flock, PARAMS) == {'leader'}
     neighbors = build_neighborhood(Memory(), own(), flock, PARAMS, 0.1)
-    assert neighbors.faced is flock[0] and neighbors.level is flock[0]
+    assert neighbors.faced is neighbors.level is neighbors.flock[0]
 
 
 @pytest.mark.parametrize(('before', 'expected'), [('', 'b'), ('a', 'a'), ('b', 'b')])
