@@ -126,9 +126,10 @@ LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',
 #: - each, of geometry, ranges, signals and system, 220.
 #:
 #: Each of them reads the odometry of any source by itself: one node that did this for all would
-#: add a hop, and its end would end all.
+#: add a hop, and its end would end all. The bridge's rose by 15 for a pilot whom no repeated
+#: command overrules.
 MOST_STATEMENTS = {
-    'relative_pose': 5564, 'planner': 3716, 'mavlink_bridge': 5876, 'flock': 1958}
+    'relative_pose': 5570, 'planner': 3718, 'mavlink_bridge': 5899, 'flock': 1961}
 
 
 class Module(NamedTuple):
