@@ -48,7 +48,7 @@ RESEND_PERIOD: Final[float] = 1.0
 NEW_REPORT: Final[float] = 0.25
 #: What ends a flight is sent in each cycle for this long, s, until an answer or a report comes; no
 #: pilot switches as soon as that.
-BURST_TIME: Final[float] = 0.3
+BURST_TIME: Final[float] = 0.12
 #: After a refusal, wait this long for the text that explains it, s.
 REASON_WAIT: Final[float] = 0.5
 #: Longest delay of a take-off, s; ArduPilot spools up for seconds.

@@ -109,7 +109,7 @@ def test_an_abort_is_sent_though_nothing_is_heard(personality, what, arguments, 
     since, outcome = flight.now, flight.ask(what, *arguments)
     assert not outcome.success and 'no answer' in outcome.message
     assert len(flight.commands(command, since)) >= 3
-    assert not flight.commands(command, since + 0.5)  # a pilot may have switched
+    assert not flight.commands(command, since + 0.2)  # a pilot may have switched
     assert what != 'land' or flight.mode == flight.modes.land
 
 
