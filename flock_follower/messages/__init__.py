@@ -188,8 +188,8 @@ def jump(before: Moving, after: Moving, elapsed: float, tolerance: float) -> flo
     The prediction is from ``elapsed`` s before, with the mean of both velocities: exact for a
     constant acceleration.
     """
-    half, (x, y, z) = 0.5 * elapsed, before.position.tolist()
-    (u, v, w), (new_u, new_v, new_w) = before.velocity.tolist(), after.velocity.tolist()
+    half, (x, y, z), (u, v, w), (new_u, new_v, new_w) = (
+        0.5 * elapsed, before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())
     distance = math.dist(after.position.tolist(), [
         x + half * (u + new_u), y + half * (v + new_v), z + half * (w + new_w)])
     return distance if distance > tolerance else 0.0

@@ -95,10 +95,10 @@ def implausible(moving: OwnState | Neighbor) -> Rejection | None:
     """Return the rejection of a state that is not finite or too fast, or None."""
     more = [moving.yaw] if isinstance(moving, OwnState) else (
         [] if moving.acceleration is None else moving.acceleration.tolist())
-    velocity = moving.velocity.tolist()
-    if not all(map(math.isfinite, [moving.stamp, *moving.position.tolist(), *velocity, *more])):
+    numbers = [moving.stamp, *moving.position.tolist(), *moving.velocity.tolist(), *more]
+    if not all(map(math.isfinite, numbers)):
         return Rejection('not finite', 'holds NaN or infinity')
-    speed = math.hypot(*velocity)
+    speed = math.hypot(*moving.velocity.tolist())
     return Rejection('too fast', f'{speed:.3g} m/s') if speed > FASTEST else None
 
 
