@@ -83,7 +83,9 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
     """
     r2 = np.einsum('ij,ij->i', offsets, offsets)
     flock = np.concatenate([np.zeros((1, differences.shape[1])), differences[~others]])
-    scale = np.where(others, pair_disagreement(differences), disagreement(flock))
+    scale: Array | float = disagreement(flock)
+    if others.any():
+        scale = np.where(others, pair_disagreement(differences), scale)
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
     push = (1.0 - share) * apart * fade(r2, params)

@@ -50,7 +50,8 @@ def jump(before: Moving, after: Moving, elapsed: float, tolerance: float) -> flo
     The prediction is from ``elapsed`` s before, with the mean of both velocities: exact for a
     constant acceleration.
     """
+    half, (x, y, z), (u, v, w), (new_u, new_v, new_w) = (
+        0.5 * elapsed, before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())
     distance = math.dist(after.position.tolist(), [
-        x + 0.5 * elapsed * (v + w) for x, v, w in zip(
-            before.position.tolist(), before.velocity.tolist(), after.velocity.tolist())])
+        x + half * (u + new_u), y + half * (v + new_v), z + half * (w + new_w)])
     return distance if distance > tolerance else 0.0

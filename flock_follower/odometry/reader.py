@@ -72,6 +72,8 @@ from flock_follower.ranges import Checked, parameter, Range
 
 #: If the reading of the velocity changes, the step is faded out with this time constant, s.
 FADE_TIME = 0.5
+#: A step that has faded to this, m/s, is over: it is less than rounding.
+FADED = 1e-15
 #: Messages over which latency and rate are reported.
 MAX_REPORTED = 50
 #: Number of attitudes kept, to derive angular rates if the messages have none.
@@ -292,9 +294,11 @@ class OdometrySource:
                 left = np.zeros(3) if self._fading is None else self._fading
                 self._fading = None if self._reading == NONE and self.twist.is_contradicted else (
                     left + self._as_read(before, time, child, odom)) - velocity
-        if self._fading is not None and np.count_nonzero(self._fading):
+        if self._fading is not None:
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading
+            if max(map(abs, self._fading.tolist())) < FADED:
+                self._fading = None
         return velocity
 
     def _as_read(self, reading: str, time: float, child: Array, odom: Array) -> Array:

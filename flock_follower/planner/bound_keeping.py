@@ -161,12 +161,12 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     slowly, goal = max(SPEED_TIME, period), complex(*limit_norm(a, SANE)[:2].tolist())
     within = complex(0.0 - vx / period, 0.0 - vy / period), left / period
     smooth = complex(lost_x - vx / slowly, lost_y - vy / slowly), left / slowly
-    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
+    discs, by_speed = Discs(
+        0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within), Discs(*smooth, *smooth)
     # Cohesion comes last in the order: the other bounds are firm.
     firm = [bound for bound, side in zip(bounds, sides) if side[2] != COHESION]
     point = nearest_in_order(goal, firm, discs)
     if len(firm) < len(bounds):
-        by_speed = Discs(*smooth, *smooth)
         reduced = [_reduce_cohesion(*bound, goal, point, firm, by_speed)
                    for bound in bounds[len(firm):]]
         bounds = [*firm, *reduced]
