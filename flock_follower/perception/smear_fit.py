@@ -365,7 +365,7 @@ def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int)
     if lens >= N_FOCUSED:
         return lens
     blur = _LENS_BLUR * pose.apply(model.middle)[2] / (camera.matrix[0, 0] * model.cell)
-    return int(np.abs(LENS_BLURS[:N_FOCUSED] - blur).argmin())
+    return min(range(N_FOCUSED), key=lambda each: abs(float(LENS_BLURS[each]) - blur))
 
 
 def _linearize(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
