@@ -211,12 +211,6 @@ def skew(vector: ArrayLike) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-#: Of the identity; read-only, because every such transform has these.
-_NO_ROTATION: Array = np.eye(3)
-_NO_TRANSLATION: Array = np.zeros(3)
-_NO_ROTATION.flags.writeable = _NO_TRANSLATION.flags.writeable = False
-
-
 class Transform(NamedTuple):
     """
     A rigid transform ``T_a_b``: coordinates in frame b to coordinates in frame a.
@@ -225,8 +219,8 @@ class Transform(NamedTuple):
     ``T_a_b @ T_b_c`` composes to ``T_a_c``; ``T_a_b.apply(p_b)`` is ``p_a``, shape (..., 3).
     """
 
-    rotation: Array = _NO_ROTATION
-    translation: Array = _NO_TRANSLATION
+    rotation: Array = np.broadcast_to(np.eye(3), (3, 3))  # read-only: all identities share it
+    translation: Array = np.broadcast_to(np.zeros(3), (3,))
 
     @classmethod
     def from_quaternion(cls, translation: ArrayLike, quaternion: ArrayLike) -> Transform:

@@ -224,10 +224,7 @@ def profiles_across(image: GrayImage, pixels: Array, along: Array, steps: Any,
     for pixel, offset in zip(pixels_around, (0, width, 1, width + 1)):
         pixel[:] = first[offset:].take(index)
     at_left, at_right = pixels_around[:2], pixels_around[2:]
-    at_right -= at_left
-    at_right *= x
-    at_left += at_right
-    above, below = at_left
+    above, below = at_left + x * (at_right - at_left)
     below -= above
     below *= y
     below += above

@@ -32,8 +32,8 @@ import numpy as np
 from flock_follower.geometry import Array, skew
 
 ALIKE_TIME = 0.25  # s, time constant of the errors
-_IDENTITY = np.eye(6)
 FORGET_AFTER = 6.0  # time constants without such a measurement until the errors are forgotten
+_IDENTITY = np.eye(6)  # np.eye takes several times as long as a copy
 
 
 class AlikeErrors:
