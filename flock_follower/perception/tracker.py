@@ -222,6 +222,7 @@ class Tracker:
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
+        image = np.ascontiguousarray(image)  # padded rows would be copied for every fit
         self.cameras[camera].take_stamp(stamp)
         look = self._look(stamp, model, self.cameras[camera])
         if isinstance(look, Missing):
