@@ -214,6 +214,7 @@ class Tracker:
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
+        image = np.ascontiguousarray(image)  # padded rows would be copied for every fit
         self.cameras[camera].take_stamp(stamp)
         look = self._look(stamp, model, self.cameras[camera])
         if isinstance(look, Missing):
@@ -348,6 +349,9 @@ class Tracker:
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbors that are not measured yet."""
         camera, dictionary = look.camera, self.config.dictionary
+        if look.measured.keys() >= {*look.near, *look.anywhere}:
+            camera.portion, camera.searched_near = 0, False
+            return
         camera.portion = camera.portion if look.missing else 0
         due = self._schedule.search_due(camera, look.stamp)
         for thorough in (False, True):
