@@ -70,28 +70,26 @@ GROSS = 30.0, 0.2, 0.3
 
 
 class Method(NamedTuple):
-    """CPU time of one method per image, its first measurement after the first image, recall."""
+    """
+    The figures of one method on one row; of a detector NEES and ``sigmas_m`` are not finite.
+
+    CPU time per image, ms, and the time from the first image to the first measurement, s.
+    ``sigmas_m`` is the mean of three standard deviations of the position, m.
+    """
 
     mean_ms: float
     p99_ms: float
     first_s: float
     recall: float
-
-
-class Row(NamedTuple):
-    """
-    The figures of one row.
-
-    ``sigmas_m`` is the mean of three standard deviations of the position, m.
-    """
-
-    methods: dict[str, Method]
     nees_position: float
     nees_velocity: float
     turned: int
     gross: int
     sigmas_m: float
     position_rms_m: float
+
+
+Row = dict[str, Method]
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -123,8 +121,7 @@ def main(args: Sequence[str] | None = None) -> int:
     for name in options.rows:
         for seed in options.seeds:
             row = fly(name, options.frames, seed, packages)
-            figures[f'{name} {seed}'] = {
-                **row._asdict(), 'methods': {m: f._asdict() for m, f in row.methods.items()}}
+            figures[f'{name} {seed}'] = {method: f._asdict() for method, f in row.items()}
             show(f'{name}, seed {seed}', row)
             missed += [f'{name}, seed {seed}: {text}' for text in misses(name, row, former)]
             if options.json:
@@ -146,30 +143,33 @@ def fly(name: str, frames: int, seed: int, packages: Sequence[str] = ()) -> Row:
             {'jitter': JITTER} if effect == 'jitter' else {'effect_': effect or 'none'}))
     flown = Flight(bag, frames, tool.traj.flight(flight)['tag'],
                    omitted=['subpix'], earlier=packages)
-    table = flown.errors['ours'].table('leader')
-    time = table['time'] - table['time'][0]
-    known = np.isfinite(table['distance']) & np.isfinite(table['true_distance'])
-    position, velocity = (np.linalg.norm(table[what][known], axis=1)
-                          for what in ('position', 'velocity'))
-    least, far, fast = GROSS
-    gross = (table['nees_position'][known] > least) & ((position > far) | (velocity > fast))
-    return Row(
-        {method: method_of(np.array(flown.milliseconds[method]),
-                           flown.errors[method].table('leader')) for method in flown.methods},
-        float(table['nees_position'][known].mean()),
-        float(table['nees_velocity'][known].mean()),
-        int(np.count_nonzero(known & (time > SETTLED) & (table['turned'] > WRONG))),
-        int(np.count_nonzero(gross)),
-        3.0 * float(np.linalg.norm(table['position_sigma'][known], axis=1).mean()),
-        float(np.sqrt(np.mean(position**2))))
+    return {method: method_of(np.array(flown.milliseconds[method]),
+                              flown.errors[method].table('leader')) for method in flown.methods}
 
 
 def method_of(ms: Array, table: dict[str, Array]) -> Method:
-    """Return the figures of a method from the times of its images and its errors."""
+    """Return the figures of a method from the CPU times of its images and its errors."""
+    time = table['time'] - table['time'][0]
     found = np.isfinite(table['distance'])
-    first = (table['time'][found] - table['time'][0])[0] if found.any() else np.inf
-    return Method(float(ms.mean()), float(np.percentile(ms, 99)), float(first),
-                  float(found.mean()))
+    known = found & np.isfinite(table['true_distance'])
+    position, velocity = (np.linalg.norm(table[what][known], axis=1)
+                          for what in ('position', 'velocity'))
+    nees = {kind: table[f'nees_{kind}'][known] for kind in ('position', 'velocity')}
+    least, far, fast = GROSS
+    gross = (nees['position'] > least) & ((position > far) | (velocity > fast))
+    return Method(
+        float(ms.mean()), float(np.percentile(ms, 99)),
+        float(time[found][0]) if found.any() else np.inf, float(found.mean()),
+        mean(nees['position']), mean(nees['velocity']),
+        int(np.count_nonzero(known & (time > SETTLED) & (table['turned'] > WRONG))),
+        int(np.count_nonzero(gross)),
+        3.0 * mean(np.linalg.norm(table['position_sigma'][known], axis=1)),
+        mean(position**2)**0.5)
+
+
+def mean(values: Array) -> float:
+    """Return the mean, NaN without values."""
+    return float(values.mean()) if len(values) else np.nan
 
 
 @cache
@@ -184,35 +184,36 @@ def load_tool() -> Any:
 
 def show(title: str, row: Row) -> None:
     """Print the figures of a row, a line for each method."""
-    unit = row.methods['default'].mean_ms
-    print(f'\n{title:<26}CPU, ms per image   in means of default    first\n'
-          '                           mean     p99       mean      p99          s  recall')
-    for method, f in row.methods.items():
-        print(f'  {method:<22}{f.mean_ms:8.2f}{f.p99_ms:8.2f}{f.mean_ms / unit:11.2f}'
-              f'{f.p99_ms / unit:9.2f}{f.first_s:11.2f}{f.recall:8.3f}')
-    print(f'  ours: NEES of position {row.nees_position:.2f}, '
-          f'of velocity {row.nees_velocity:.2f}; {row.turned} turned, {row.gross} gross; '
-          f'position: 3 sigma {1e3 * row.sigmas_m:.1f} mm, RMS {1e3 * row.position_rms_m:.1f} mm',
-          flush=True)
+    unit = row['default'].mean_ms
+    print(f'\n{title:<26}CPU, ms per image   in means of default   first          NEES of'
+          '                         RMS\n'
+          '                           mean     p99      mean     p99        s  recall  '
+          'position  velocity turned gross  mm')
+    for method, f in row.items():
+        nees = (f'{f.nees_position:10.2f}{f.nees_velocity:10.2f}{f.turned:7d}{f.gross:6d}'
+                if np.isfinite(f.sigmas_m) else f"{'-':>10}{'-':>10}{f.turned:7d}{'-':>6}")
+        print(f'  {method:<22}{f.mean_ms:8.2f}{f.p99_ms:8.2f}{f.mean_ms / unit:10.2f}'
+              f'{f.p99_ms / unit:8.2f}{f.first_s:9.2f}{f.recall:8.3f}{nees}'
+              f'{1e3 * f.position_rms_m:7.1f}')
+    print(f"  3 sigma of ours: {1e3 * row['ours'].sigmas_m:.1f} mm", flush=True)
 
 
 def misses(name: str, row: Row, former: str = '') -> list[str]:
     """Return the bounds that a row misses, also beside the method ``former``, and its figures."""
     flight, _, effect = name.partition('/')
     recall = RECALL.get(effect, LEAST_RECALL)
-    ours, default = row.methods['ours'], row.methods['default']
-    aruco2 = row.methods.get('aruco2')
-    before = row.methods.get(former)
+    ours, default, aruco2, before = map(row.get, ('ours', 'default', 'aruco2', former))
+    assert ours is not None and default is not None
     checks = [
         (f'p99 {ours.p99_ms / default.mean_ms:.2f} means of default, must be at most 1',
          flight == 'room_hd' or ours.p99_ms <= default.mean_ms),
         (f'first measured after {ours.first_s:.2f} s, must be within {MAX_FIRST:g} s',
          ours.first_s <= MAX_FIRST),
         (f'recall {ours.recall:.3f}, must be at least {recall:g}', ours.recall >= recall),
-        (f'NEES {row.nees_position:.2f}, must be at most {MAX_NEES:g}',
-         row.nees_position <= MAX_NEES),
-        (f'{row.turned} attitudes turned, must be 0', not row.turned),
-        (f'{row.gross} gross images, must be 0', not row.gross)]
+        (f'NEES {ours.nees_position:.2f}, must be at most {MAX_NEES:g}',
+         ours.nees_position <= MAX_NEES),
+        (f'{ours.turned} attitudes turned, must be 0', not ours.turned),
+        (f'{ours.gross} gross images, must be 0', not ours.gross)]
     if flight in SMEARED or effect in SMEARED:
         share = ours.mean_ms / default.mean_ms
         checks.append((f'mean {share:.2f} of that of default, must be at most 1', share <= 1.0))
