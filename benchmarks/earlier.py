@@ -69,6 +69,11 @@ def copy_package(commit: str) -> str:
     return name
 
 
+def commit_of(package: str) -> str:
+    """Return the commit of a package's name."""
+    return package.removeprefix(f'{NAME}_')
+
+
 class Earlier:
     """
     A tracker of an earlier commit, with one camera.

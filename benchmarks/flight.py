@@ -31,7 +31,7 @@ import time
 from typing import Any, NamedTuple
 
 from detectors import ARUCO, detectors, Look
-from earlier import Earlier
+from earlier import commit_of, Earlier
 import numpy as np
 
 from flock_desk.camera.renderer import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
@@ -112,18 +112,18 @@ class Flight:
     :param count: images to play, 0 for all.
     :param dictionary: of the leader's marker.
     :param omitted: names of detectors that do not take part.
-    :param earlier: name of an earlier package that takes part, see ``earlier.py``.
+    :param earlier: packages of earlier commits that take part, see ``earlier.py``.
     """
 
     def __init__(self, bag: Path, count: int, dictionary: str = ARUCO, *,
-                 omitted: Sequence[str] = (), earlier: str | None = None) -> None:
+                 omitted: Sequence[str] = (), earlier: Sequence[str] = ()) -> None:
         self.config = replace(neighbors.load(resource('config/neighbors.yaml')),
                               dictionary=dictionary)
         self.detectors = {name: corners for name, corners in detectors(dictionary).items()
                           if name not in omitted}
-        self.package = earlier
+        self.packages = earlier
         self.earlier = self._new_earlier()
-        self.methods = (*self.detectors, *(['before'] if self.earlier else []), 'ours')
+        self.methods = (*self.detectors, *self.earlier, 'ours')
         self.milliseconds: dict[str, list[float]] = {m: [] for m in self.methods}
         self.errors = {m: FrameErrors(self.config.neighbors, T_BODY_OPTICAL, START_NS)
                        for m in self.methods}
@@ -150,8 +150,8 @@ class Flight:
             self.own.append(from_odometry(message))
             self.odometry.append(message)
             self.perceiver.take_odometry(self.own[-1])
-            if self.earlier is not None:
-                self.earlier.take_odometry(message)
+            for each in self.earlier.values():
+                each.take_odometry(message)
             for errors in self.errors.values():
                 errors.odometry(self.own[-1])
         elif topic == '/truth/odom':
@@ -162,8 +162,8 @@ class Flight:
                 errors.truth(from_odometry(message))
         elif topic == '/camera_info':
             self.info = message
-            if self.earlier is not None:
-                self.earlier.take_camera_info(message)
+            for each in self.earlier.values():
+                each.take_camera_info(message)
             if self.perceiver.take_camera_info(message):
                 model = self.perceiver.model()
                 assert model is not None
@@ -200,12 +200,11 @@ class Flight:
     def timed(self, method: str, stamp: int, seconds: float, image: GrayImage,
               model: CameraModel) -> float:
         """Give an image to a method, store its result, and return the CPU time, ms."""
-        look = self.looks.get(method)
+        look, earlier = self.looks.get(method), self.earlier.get(method)
         start = time.process_time_ns()
         if look is None:
-            if method == 'before':
-                assert self.earlier is not None
-                sighting = self.earlier.process_image(stamp, image)
+            if earlier is not None:
+                sighting = earlier.process_image(stamp, image)
             else:
                 sighting = Tracker.process_image(self.perceiver.tracker, seconds, image, model)
             spent = time.process_time_ns() - start
@@ -225,7 +224,7 @@ class Flight:
             other.take_odometry(state)
             Tracker.process_image(other.tracker, 1e-9 * (state.stamp - self.own[-3:][0].stamp),
                                   image, model)
-        if (earlier := self._new_earlier()) is not None:
+        for earlier in self._new_earlier().values():
             earlier.take_camera_info(self.info)
             for message in self.odometry:
                 earlier.take_odometry(message)
@@ -235,10 +234,9 @@ class Flight:
         gc.collect()
         gc.freeze()  # as the node does before it spins
 
-    def _new_earlier(self) -> Earlier | None:
-        if self.package is None:
-            return None
-        return Earlier(self.package, self.config.dictionary, T_BODY_OPTICAL)
+    def _new_earlier(self) -> dict[str, Earlier]:
+        return {commit_of(package): Earlier(package, self.config.dictionary, T_BODY_OPTICAL)
+                for package in self.packages}
 
     def state(self, method: str, stamp: int, T_camera_marker: Transform) -> State:
         """Return a detector's state of the leader, its velocity from two positions."""
