@@ -132,6 +132,23 @@ def test_jump_without_matching_velocity_shifts_reference_counted(jump):
     assert max(abs(h) for h in found[60:]) < 0.35 * max(1.0, abs(jump) / 2.0)
 
 
+@pytest.mark.parametrize(('period', 'jump', 'jumped'), [
+    (0.0625, 0.3, False), (0.0625, 0.32, True), (0.0625, -0.3, False), (0.0625, -0.32, True),
+    (0.09375, 0.3, False), (0.09375, 0.32, True), (0.125, 2.0, False)])  # periods without rounding
+def test_jump_counts_from_a_size_on_in_three_samples(period, jump, jumped):
+    heights = HeightEstimator()
+    for k in range(80):
+        now = k * period
+        heights.take(100.0 + jump * (k >= 40), 0.0, now, acceleration=0.0)
+        if k == 39:
+            heights.refer(2.0, now)
+    assert (40.0 * period <= heights.stepped < 40.0 * period + 0.25) == jumped
+    if jumped:  # its speed is not that of the jump
+        assert heights.climb_rate == 0.0 and abs(heights.height(now) - 2.0) < 0.4 * abs(jump)
+    else:
+        assert heights.stepped == -math.inf
+
+
 def test_for_a_while_after_a_jump_the_height_is_lost():
     heights, _ = flown(10.3, lambda t: 1.0 * (t > 10.0))
     assert heights.obstacle(10.25) is Obstacle.HEIGHT_JUMPED
