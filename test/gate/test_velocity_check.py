@@ -279,7 +279,8 @@ def test_a_path_keeps_the_window_in_tenths_of_a_second() -> None:
     for now, newest in ((0.0, 0.0), (0.04, 0.0), (0.09, 0.0), (0.1, 0.1), (0.19, 0.1)):
         path.take(np.array([now, 0.0, 0.0]), None, now)
         assert path.span == (0.0, newest)
-    path.take(np.array([9.0, 0.0, 0.0]), None, 0.15)  # older than the newest
+    for now in (0.15, 0.19):  # not newer
+        path.take(np.array([9.0, 0.0, 0.0]), None, now)
     assert path.time == 0.19 and path.position is not None and path.position[0] == 0.19
     for step in range(2, 81):
         path.take(np.zeros(3), None, 0.1 * step)
