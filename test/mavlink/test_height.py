@@ -30,7 +30,7 @@ from flock_follower.gate.height import (
     STEP_PAUSE,
 )
 from flock_follower.gate.obstacle import Obstacle
-from flock_follower.messages import SANE
+from flock_follower.messages import FASTEST_OWN, SANE
 
 PERIOD = 0.05
 NOISE = 0.09  # m: SCALED_PRESSURE of PX4 1.16, SIH
@@ -41,7 +41,8 @@ def flown(seconds, altitude=lambda t: 100.0, rate=lambda t: 0.0):
     rng, heights, found = np.random.default_rng(1), HeightEstimator(), []
     for k in range(round(seconds / PERIOD)):
         now = k * PERIOD
-        assert heights.take(altitude(now) + NOISE * rng.normal(), rate(now), now) == ''
+        sensor = ''.join(('SCALED_', 'PRESSURE'))  # an equal name each time
+        assert heights.take(altitude(now) + NOISE * rng.normal(), rate(now), now, sensor) == ''
         if k == 40:
             heights.refer(0.0, now)
         found.append(heights.height(now))
@@ -51,6 +52,7 @@ def flown(seconds, altitude=lambda t: 100.0, rate=lambda t: 0.0):
 def test_pressures_are_altitudes_of_the_standard_atmosphere():
     assert pressure_altitude(1013.25) == 0.0
     assert pressure_altitude(954.61) == pytest.approx(500.0, abs=0.5)  # ISO 2533
+    assert pressure_altitude(1074.78) == pytest.approx(-500.0, abs=0.5)
     assert all(math.isnan(pressure_altitude(p)) for p in (0.0, -1.0, 2000.0, math.nan, math.inf))
 
 
@@ -70,6 +72,7 @@ def test_sensor_alone_is_followed_by_its_bandwidth(elapsed, difference, altitude
     assert heights.altitude(elapsed) == pytest.approx(100.0 + altitude)
     assert heights.climb_rate == pytest.approx(rate)
     assert heights.altitude(elapsed + 0.5) == pytest.approx(100.0 + altitude + 0.5 * rate)
+    assert heights.altitude(elapsed - 0.1) == heights.altitude(elapsed)
 
 
 def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
@@ -80,7 +83,8 @@ def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
     assert found == pytest.approx([-math.inf, -math.inf, -math.inf, 0.3, 0.3])
 
 
-@pytest.mark.parametrize(('seconds', 'before', 'error'), [(8.0, 1.0, 0.3), (2.0, 0.59, 0.0)])
+@pytest.mark.parametrize(('seconds', 'before', 'error'), [
+    (8.0, 1.0, 0.3), (3.1, 0.82, 0.12), (2.9, 0.78, 0.0), (2.0, 0.59, 0.0)])
 def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, error):
     heights = HeightEstimator()
     for k in range(round(seconds / PERIOD)):
@@ -104,12 +108,40 @@ def test_a_climb_is_followed_whatever_the_odometry_says_of_it(rate):
         assert found[200] == pytest.approx(climb(10.0), abs=0.1)
 
 
+def test_a_climb_that_the_other_source_denies_is_no_jump():
+    heights = HeightEstimator()
+    for k in range(200):
+        heights.take(max(k * PERIOD - 4.0, 0.0), 0.0, k * PERIOD)
+        assert heights.stepped == -math.inf
+
+
 @pytest.mark.parametrize(('lacks', 'seconds'), [(0.0, 20.0), (0.3, 20.0), (-0.3, 20.0),
                                                 (0.8, 6.0), (-0.8, 6.0)])
 def test_other_source_is_corrected_in_seconds_hardly_disturbed(lacks, seconds):
     heights, _ = flown(seconds, altitude=lambda t: 100.0 + lacks * t)
     assert heights.correct(2.0, seconds) == pytest.approx(2.0 + lacks, abs=0.05)
     assert heights.correct(2.0, seconds + HEIGHT_TIMEOUT) == 2.0
+
+
+def test_what_is_corrected_beyond_its_bound_grows_in_ten_seconds():
+    """The sensor climbs ever faster, to 3 m/s, where the other source knows of nothing."""
+    heights = HeightEstimator()
+    for k in range(401):
+        now = k * PERIOD
+        heights.take(0.15 * min(now, 10.0) ** 2 + 3.0 * max(now - 10.0, 0.0), 0.0, now)
+        if k in (200, 300, 400):
+            assert heights.correct(0.0, now) == pytest.approx(
+                {200: 1.77, 300: 2.58, 400: 3.0}[k], abs=0.03)
+    assert heights.stepped == -math.inf
+
+
+@pytest.mark.parametrize(('rate', 'known'), [
+    (FASTEST_OWN, True), (-FASTEST_OWN, True), (1.01 * FASTEST_OWN, False), (math.nan, False),
+    (-math.inf, False)])
+def test_an_absurd_rate_of_another_source_counts_as_none(rate, known):
+    heights = HeightEstimator()
+    assert heights.take(100.0, rate, 5.0) == ''
+    assert heights.climb_rate == (rate if known else 0.0)
 
 
 @pytest.mark.parametrize(('altitude', 'now', 'refused'), [
@@ -175,6 +207,7 @@ def test_for_a_while_after_a_jump_the_height_is_lost():
 def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     heights = HeightEstimator()
     assert heights.height(0.0) is None and heights.obstacle(0.0) is None
+    assert heights.climb_rate == 0.0 and heights.correct(1.0, 0.0) == 1.0
     heights.take(50.0, None, 1.0)
     assert heights.height(1.0) is None and heights.altitude(1.0) == 50.0
     heights.refer(1.5, 1.0)
