@@ -83,15 +83,16 @@ def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
     assert found == pytest.approx([-math.inf, -math.inf, -math.inf, 0.3, 0.3])
 
 
-@pytest.mark.parametrize(('seconds', 'before', 'error'), [
-    (8.0, 1.0, 0.3), (3.1, 0.82, 0.12), (2.9, 0.78, 0.0), (2.0, 0.59, 0.0)])
-def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, error):
+@pytest.mark.parametrize('rate', [0.7, -0.2])  # by the other source, when it comes
+@pytest.mark.parametrize(('seconds', 'before', 'settled'), [
+    (8.0, 1.0, True), (3.1, 0.82, True), (2.9, 0.78, False), (2.0, 0.59, False)])
+def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, settled, rate):
     heights = HeightEstimator()
     for k in range(round(seconds / PERIOD)):
         heights.take(0.05 * k, None, k * PERIOD)  # climbs at 1 m/s
     assert before - 0.1 < heights.climb_rate < before + 0.1
-    heights.take(seconds, 0.7, seconds)  # 0.3 m/s too slow
-    assert heights.climb_rate == pytest.approx(0.7 + error, abs=0.03)
+    heights.take(seconds, rate, seconds)
+    assert heights.climb_rate == pytest.approx(before if settled else rate, abs=0.03)
 
 
 def climb(t):
@@ -210,6 +211,7 @@ def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     assert heights.climb_rate == 0.0 and heights.correct(1.0, 0.0) == 1.0
     heights.take(50.0, None, 1.0)
     assert heights.height(1.0) is None and heights.altitude(1.0) == 50.0
+    assert heights.altitude(1.0 + HEIGHT_TIMEOUT) == 50.0
     heights.refer(1.5, 1.0)
     assert heights.height(1.0) == 1.5
     late = 1.01 + HEIGHT_TIMEOUT
