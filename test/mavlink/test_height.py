@@ -67,8 +67,8 @@ def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():
     (HEIGHT_TIMEOUT + 0.01, 0.2, 0.2, 0.0)])  # it begins again
 def test_sensor_alone_is_followed_by_its_bandwidth(elapsed, difference, altitude, rate):
     heights = HeightEstimator()
-    heights.take(100.0, None, 0.0)
-    heights.take(100.0 + difference, None, elapsed)
+    heights.take(100.0, None, 0.0, 'SCALED_PRESSURE')
+    heights.take(100.0 + difference, None, elapsed, 'SCALED_PRESSURE')
     assert heights.altitude(elapsed) == pytest.approx(100.0 + altitude)
     assert heights.climb_rate == pytest.approx(rate)
     assert heights.altitude(elapsed + 0.5) == pytest.approx(100.0 + altitude + 0.5 * rate)
@@ -284,6 +284,15 @@ def test_suspected_source_is_followed_by_the_fast_observer(side):
         drift = side * 0.45 * max(now - 10.0, 0.0)
         heights.take(100.0, drift, now, acceleration=0.0)
     assert heights.correct(drift, now) == pytest.approx(side * (0.45 * 2.0 / 3.0 + 0.25), abs=0.03)
+
+
+@pytest.mark.parametrize(('jump', 'counts'), [(12.5, False), (13.0, False), (13.5, True)])
+def test_for_three_seconds_a_suspected_source_proves_no_jump(jump, counts):
+    heights = HeightEstimator()
+    for k in range(round((jump + 0.2) / PERIOD)):
+        now = k * PERIOD  # suspicious until 10.3 s
+        heights.take(100.0 + 2.0 * (now > jump), 0.4 * (now > 10.0), now, acceleration=0.0)
+    assert (heights.stepped > jump) == counts
 
 
 @pytest.mark.parametrize('acceleration', [2.0, -2.0])
