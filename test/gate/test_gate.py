@@ -194,7 +194,7 @@ def test_a_height_that_ceases_hands_the_vehicle_over():
     (0, True, '', ''), (0, False, 'rests on GPS, whose fix is lost', '')])
 def test_displacement_mismatch_brakes_and_hands_over(
         axis, fused, distrusted, other):
-    gate = fresh_gate()
+    gate, kinds, handovers = fresh_gate(), [], []
     gate.autopilot = gate.autopilot._replace(fused=fused)
     for now in np.arange(10.0, 20.0, 0.05):
         gate.take_motion('odom', MotionReport([0.0, 0.0, 0.0]), 0.0, now)
@@ -203,8 +203,12 @@ def test_displacement_mismatch_brakes_and_hands_over(
         gate.take_height(2.0, now)
         gate.take_command(Command(FORWARD, 1.0), 0.0, now)
         decision = decide(gate, now, distrusted=distrusted)
+        kinds.append(decision.kind)
+        handovers.append(bool(gate.handover(now)))
     assert (decision.kind == 'brake') == bool(other)
     assert other in decision.reason and other in gate.handover(now)
+    if other:  # it brakes for a second before
+        assert handovers.index(True) - kinds.index('brake') == pytest.approx(20, abs=1)
 
 
 @pytest.mark.parametrize(('height', 'climb', 'end'), [

@@ -37,7 +37,6 @@ from flock_follower.gate.velocity_check import (
     Source,
     SourceMotion,
     VelocityComparison,
-    YAW_MEMORY,
 )
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, FUTURE_TOLERANCE, OdometryState, SANE
@@ -148,6 +147,14 @@ def test_it_is_blind_once_the_last_velocity_is_long_gone(ages, is_blind):
     assert blind(*ages) == is_blind
 
 
+@pytest.mark.parametrize(('seconds', 'contradiction'), [
+    (-math.inf, None), (-0.1, None), (0.0, Obstacle.VELOCITIES_DISAGREE),
+    (9.0, Obstacle.VELOCITIES_DISAGREE)])
+def test_no_velocity_brakes_while_two_disagree(seconds, contradiction):
+    known = by(ODOM, disagreeing_for=seconds)
+    assert known.contradiction is contradiction and (known.braking is None) == bool(contradiction)
+
+
 @pytest.mark.parametrize('why', ['disagreeing_for', 'distrusted_for'])
 @pytest.mark.parametrize(('seconds', 'is_blind'), [
     (-0.01, False), (0.6, False), (0.601, True), (math.inf, True), (math.nan, False)])
@@ -162,7 +169,7 @@ def test_it_is_blind_sooner_with_an_untrusted_velocity(
 
 def compared(differences, rate=20.0):
     """Return the comparison after differences of a time each, and the time of the last."""
-    comparison, now = VelocityComparison(), 100.0
+    comparison, now = VelocityComparison(), 0.0
     for value in differences:
         now += 1.0 / rate
         comparison.take(np.array([value, 0.0, 0.0]), 0.25, True, now)
@@ -184,7 +191,10 @@ def test_velocities_disagree_by_mean_sooner_if_more(differences, disagree):
 
 def test_the_first_difference_has_no_weight_the_next_have() -> None:
     assert compared([0.7])[0].difference == 0.0
-    assert compared([0.7, 0.7])[0].difference == pytest.approx(0.7 * (1.0 - math.exp(-0.05 / 0.3)))
+    for rate, step in ((20.0, 0.05), (5.0, 0.1)):  # of a long pause nothing is known
+        for value, counted in ((0.7, 0.7), (1e9, 3.0 * 0.25)):  # nor how wrong one sample is
+            assert compared([value] * 2, rate)[0].difference == pytest.approx(
+                counted * (1.0 - math.exp(-step / 0.3)))
 
 
 @pytest.mark.parametrize(('samples', 'latched'), [(20, True), (4, False)])
@@ -225,16 +235,28 @@ def test_equal_motions_in_turned_frames_do_not_differ(turn):
 
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
-@pytest.mark.parametrize(('seconds', 'shown'), [(12.0, 0.2 * DISPLACEMENT_WINDOW), (2.0, 0.4)])
+@pytest.mark.parametrize(('seconds', 'shown'), [(12.05, 0.99), (2.0, 0.39)])
 def test_a_velocity_error_adds_up_over_the_window(axis, seconds, shown):
     drift = np.eye(3)[axis]
     first, second = paths(seconds, lambda t: 0.2 * t * drift, still)
-    np.testing.assert_allclose(difference(first, second, 0.0, seconds), shown * drift, atol=0.02)
+    np.testing.assert_allclose(difference(first, second, 0.0, seconds), shown * drift, atol=1e-9)
 
 
-def test_a_jump_that_the_velocity_does_not_match_is_taken_out():
-    first, second = paths(8.0, lambda t: (1.5 * (t > 6.0), 0.0, 0.0), still, velocity=np.zeros(3))
+@pytest.mark.parametrize('speed', [0.0, 0.4])
+def test_a_jump_that_the_velocity_does_not_match_is_taken_out(speed):
+    first, second = paths(8.0, lambda t: (speed * t + 1.5 * (t > 6.0), 0.0, 0.0),
+                          lambda t: (speed * t, 0.0, 0.0), velocity=np.array([speed, 0.0, 0.0]))
     assert np.linalg.norm(difference(first, second, 0.0, 8.0)) < 1e-9
+
+
+@pytest.mark.parametrize('before', [None, (0.0, 1.0, 0.0)])
+@pytest.mark.parametrize('elapsed', [0.05, 0.5])
+@pytest.mark.parametrize(('surprise', 'jumped'), [(0.29, False), (0.31, True)])
+def test_without_a_gap_a_jump_is_more_than_position_jump(before, elapsed, surprise, jumped):
+    path = Path()
+    path.take(np.zeros(3), None if before is None else np.array(before), 1.0)
+    path.take(np.array([0.0, 0.0, surprise]), np.zeros(3), 1.0 + elapsed)
+    assert path.position[2] == pytest.approx(0.0 if jumped else surprise)
 
 
 def test_a_displacement_within_the_window_follows_a_curve() -> None:
@@ -248,6 +270,8 @@ def test_a_displacement_within_the_window_follows_a_curve() -> None:
         last = min(last, end)
         np.testing.assert_allclose(
             path.displacement(first, last), curve(last) - curve(first), atol=0.005)
+    np.testing.assert_allclose(  # at the beginning, too
+        paths(1.0, curve, still)[0].displacement(0.05, 1.0), curve(1.0) - curve(0.05), atol=0.005)
 
 
 def test_a_path_keeps_the_window_in_tenths_of_a_second() -> None:
@@ -255,7 +279,8 @@ def test_a_path_keeps_the_window_in_tenths_of_a_second() -> None:
     for now, newest in ((0.0, 0.0), (0.04, 0.0), (0.09, 0.0), (0.1, 0.1), (0.19, 0.1)):
         path.take(np.array([now, 0.0, 0.0]), None, now)
         assert path.span == (0.0, newest)
-    path.take(np.array([9.0, 0.0, 0.0]), None, 0.15)  # older than the newest
+    for now in (0.15, 0.19):  # not newer
+        path.take(np.array([9.0, 0.0, 0.0]), None, now)
     assert path.time == 0.19 and path.position is not None and path.position[0] == 0.19
     for step in range(2, 81):
         path.take(np.zeros(3), None, 0.1 * step)
@@ -289,7 +314,7 @@ def test_a_position_beyond_a_sane_one_changes_nothing() -> None:
 
 @pytest.mark.parametrize(('age', 'jumped'), [(0.2, True), (0.4, False)])
 def test_only_a_fresh_velocity_finds_a_jump(age: float, jumped: bool) -> None:
-    source, now = Source(), 10.0
+    source, now = Source(), 0.5
     source.take_velocity(np.zeros(3), now - age)
     source.take_position((0.0, 0.0, 0.0), now - 0.1, 0.0, 0.3)
     source.take_position((2.0, 0.0, 0.0), now, 0.0, 0.3)
@@ -307,8 +332,10 @@ def test_ages_of_velocity_and_yaw_count_from_their_own_times() -> None:
 
 def test_what_is_old_or_interrupted_is_not_compared():
     first, second = paths(8.0, lambda t: (t, 0.0, 0.0), still)
-    assert not difference(first, second, 0.0, 8.6).any()
-    assert not difference(first, Path(), 0.0, 8.0).any()
+    assert np.array_equal(difference(first, second, 0.0, 8.6), np.zeros(3))
+    assert np.array_equal(difference(first, Path(), 0.0, 8.0), np.zeros(3))
+    soon, other = paths(0.2, lambda t: (t, 0.0, 0.0), still)
+    assert not difference(soon, other, 0.0, 0.9).any()
     for path in (first, second):
         path.take(np.array([99.0, 0.0, 0.0]), None, 9.0)  # after a gap it begins again
     assert not difference(first, second, 0.0, 9.0).any()
@@ -332,6 +359,16 @@ def test_displacement_mismatch_beyond_deviation_is_reported(
     assert not why or ('barometer' in why.detail) == height
 
 
+@pytest.mark.parametrize('turn', [-0.4, 0.4])
+@pytest.mark.parametrize(('speed', 'contradicts'), [(0.5, False), (0.7, True)])
+def test_displacements_are_compared_in_one_frame(turn, speed, contradicts):
+    odom, autopilot = Source(), Source()
+    odom.path, autopilot.path = paths(
+        4.0, lambda t: (speed * t, 0.0, 0.0), lambda t: (0.5 * t, 0.0, 0.0), turn)
+    # Anticlockwise axes of odometry make its yaw smaller.
+    assert bool(find_displacement(odom, autopilot, -turn, Path(), 4.0)) == contradicts
+
+
 def test_yaw_nearest_to_time_is_returned_old_ones_forgotten():
     source = Source()
     assert source.yaw(1.0) == source.yaw() == (0.0, -math.inf)
@@ -340,7 +377,7 @@ def test_yaw_nearest_to_time_is_returned_old_ones_forgotten():
     for refused, time in ((1.0, 2.95), (math.nan, 3.1)):  # out of order, not finite
         source.take_yaw(refused, time)
     assert source.yaw() == pytest.approx((0.5, 3.0))
-    for time, nearest in ((2.52, 2.5), (2.58, 2.6), (2.04, 2.0), (0.0, 3.0 - YAW_MEMORY)):
+    for time, nearest in ((2.52, 2.5), (2.58, 2.6), (2.48, 2.5), (2.04, 2.0), (0.0, 2.0)):
         assert source.yaw(time) == pytest.approx((nearest - 2.5, nearest))
     kept = len(source.yaws)
     source.take_yaw(0.5 + math.pi, 3.0)  # of the same time: the later report, wrapped

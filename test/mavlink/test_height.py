@@ -30,6 +30,7 @@ from flock_follower.gate.height import (
     STEP_PAUSE,
 )
 from flock_follower.gate.obstacle import Obstacle
+from flock_follower.messages import FASTEST_OWN, SANE
 
 PERIOD = 0.05
 NOISE = 0.09  # m: SCALED_PRESSURE of PX4 1.16, SIH
@@ -40,7 +41,8 @@ def flown(seconds, altitude=lambda t: 100.0, rate=lambda t: 0.0):
     rng, heights, found = np.random.default_rng(1), HeightEstimator(), []
     for k in range(round(seconds / PERIOD)):
         now = k * PERIOD
-        assert heights.take(altitude(now) + NOISE * rng.normal(), rate(now), now) == ''
+        sensor = ''.join(('SCALED_', 'PRESSURE'))  # an equal name each time
+        assert heights.take(altitude(now) + NOISE * rng.normal(), rate(now), now, sensor) == ''
         if k == 40:
             heights.refer(0.0, now)
         found.append(heights.height(now))
@@ -50,6 +52,7 @@ def flown(seconds, altitude=lambda t: 100.0, rate=lambda t: 0.0):
 def test_pressures_are_altitudes_of_the_standard_atmosphere():
     assert pressure_altitude(1013.25) == 0.0
     assert pressure_altitude(954.61) == pytest.approx(500.0, abs=0.5)  # ISO 2533
+    assert pressure_altitude(1074.78) == pytest.approx(-500.0, abs=0.5)
     assert all(math.isnan(pressure_altitude(p)) for p in (0.0, -1.0, 2000.0, math.nan, math.inf))
 
 
@@ -64,11 +67,12 @@ def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():
     (HEIGHT_TIMEOUT + 0.01, 0.2, 0.2, 0.0)])  # it begins again
 def test_sensor_alone_is_followed_by_its_bandwidth(elapsed, difference, altitude, rate):
     heights = HeightEstimator()
-    heights.take(100.0, None, 0.0)
-    heights.take(100.0 + difference, None, elapsed)
+    heights.take(100.0, None, 0.0, 'SCALED_PRESSURE')
+    heights.take(100.0 + difference, None, elapsed, 'SCALED_PRESSURE')
     assert heights.altitude(elapsed) == pytest.approx(100.0 + altitude)
     assert heights.climb_rate == pytest.approx(rate)
     assert heights.altitude(elapsed + 0.5) == pytest.approx(100.0 + altitude + 0.5 * rate)
+    assert heights.altitude(elapsed - 0.1) == heights.altitude(elapsed)
 
 
 def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
@@ -79,14 +83,16 @@ def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
     assert found == pytest.approx([-math.inf, -math.inf, -math.inf, 0.3, 0.3])
 
 
-@pytest.mark.parametrize(('seconds', 'before', 'error'), [(8.0, 1.0, 0.3), (2.0, 0.59, 0.0)])
-def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, error):
+@pytest.mark.parametrize('rate', [0.7, -0.2])  # by the other source, when it comes
+@pytest.mark.parametrize(('seconds', 'before', 'settled'), [
+    (8.0, 1.0, True), (3.1, 0.82, True), (2.9, 0.78, False), (2.0, 0.59, False)])
+def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, settled, rate):
     heights = HeightEstimator()
     for k in range(round(seconds / PERIOD)):
         heights.take(0.05 * k, None, k * PERIOD)  # climbs at 1 m/s
     assert before - 0.1 < heights.climb_rate < before + 0.1
-    heights.take(seconds, 0.7, seconds)  # 0.3 m/s too slow
-    assert heights.climb_rate == pytest.approx(0.7 + error, abs=0.03)
+    heights.take(seconds, rate, seconds)
+    assert heights.climb_rate == pytest.approx(before if settled else rate, abs=0.03)
 
 
 def climb(t):
@@ -103,11 +109,51 @@ def test_a_climb_is_followed_whatever_the_odometry_says_of_it(rate):
         assert found[200] == pytest.approx(climb(10.0), abs=0.1)
 
 
-@pytest.mark.parametrize('lacks', [0.0, 0.3, -0.3])
-def test_other_source_is_corrected_in_seconds_hardly_disturbed(lacks):
-    heights, _ = flown(20.0, altitude=lambda t: 100.0 + lacks * t)
-    assert heights.correct(2.0, 20.0) == pytest.approx(2.0 + lacks, abs=0.05)
-    assert heights.correct(2.0, 20.0 + HEIGHT_TIMEOUT) == 2.0
+def test_a_climb_that_the_other_source_denies_is_no_jump():
+    heights = HeightEstimator()
+    for k in range(200):
+        heights.take(max(k * PERIOD - 4.0, 0.0), 0.0, k * PERIOD)
+        assert heights.stepped == -math.inf
+
+
+@pytest.mark.parametrize(('lacks', 'seconds'), [(0.0, 20.0), (0.3, 20.0), (-0.3, 20.0),
+                                                (0.8, 6.0), (-0.8, 6.0)])
+def test_other_source_is_corrected_in_seconds_hardly_disturbed(lacks, seconds):
+    heights, _ = flown(seconds, altitude=lambda t: 100.0 + lacks * t)
+    assert heights.correct(2.0, seconds) == pytest.approx(2.0 + lacks, abs=0.05)
+    assert heights.correct(2.0, seconds + HEIGHT_TIMEOUT) == 2.0
+
+
+def test_what_is_corrected_beyond_its_bound_grows_in_ten_seconds():
+    """The sensor climbs ever faster, to 3 m/s, where the other source knows of nothing."""
+    heights = HeightEstimator()
+    for k in range(401):
+        now = k * PERIOD
+        heights.take(0.15 * min(now, 10.0) ** 2 + 3.0 * max(now - 10.0, 0.0), 0.0, now)
+        if k in (200, 300, 400):
+            assert heights.correct(0.0, now) == pytest.approx(
+                {200: 1.77, 300: 2.58, 400: 3.0}[k], abs=0.03)
+    assert heights.stepped == -math.inf
+
+
+@pytest.mark.parametrize(('rate', 'known'), [
+    (FASTEST_OWN, True), (-FASTEST_OWN, True), (1.01 * FASTEST_OWN, False), (math.nan, False),
+    (-math.inf, False)])
+def test_an_absurd_rate_of_another_source_counts_as_none(rate, known):
+    heights = HeightEstimator()
+    assert heights.take(100.0, rate, 5.0) == ''
+    assert heights.climb_rate == (rate if known else 0.0)
+
+
+@pytest.mark.parametrize(('altitude', 'now', 'refused'), [
+    (100.0, 5.1, ''), (SANE, 5.1, ''), (-SANE, 5.1, ''), (1.01 * SANE, 5.1, 'not plausible'),
+    (math.nan, 5.1, 'not plausible'), (math.inf, 5.1, 'not plausible'),
+    (100.0, 5.0, 'not newer'), (100.0, 4.9, 'not newer'), (100.0, math.nan, 'not newer')])
+def test_altitude_that_is_absurd_or_not_newer_changes_nothing(altitude, now, refused):
+    heights = HeightEstimator()
+    heights.take(90.0, 1.0, 5.0)
+    assert heights.take(altitude, -1.0, now) == refused
+    assert (heights.climb_rate == 1.0) == bool(refused)
 
 
 @pytest.mark.parametrize('back', [11.5, 14.5])  # s: in the descent, after the touchdown
@@ -132,6 +178,26 @@ def test_jump_without_matching_velocity_shifts_reference_counted(jump):
     assert max(abs(h) for h in found[60:]) < 0.35 * max(1.0, abs(jump) / 2.0)
 
 
+@pytest.mark.parametrize(('period', 'jump', 'jumped'), [
+    (0.0625, 0.3, False), (0.0625, 0.32, True), (0.0625, -0.3, False), (0.0625, -0.32, True),
+    (0.09375, 0.3, False), (0.09375, 0.32, True), (0.125, 2.0, False)])  # periods without rounding
+def test_jump_counts_from_a_size_on_in_three_samples(period, jump, jumped):
+    for first in (8, 40):
+        heights = HeightEstimator()
+        for k in range(120):
+            now = k * period
+            heights.take(100.0 + jump * (k >= first), 0.0, now, acceleration=0.0)
+            if k == 7:
+                heights.refer(2.0, now)
+            pausing = 0.0 <= now - heights.stepped < STEP_PAUSE
+            assert (heights.obstacle(now) is Obstacle.HEIGHT_JUMPED) == pausing
+        assert (first * period <= heights.stepped < first * period + 0.25) == jumped
+        if jumped:  # its speed is not that of the jump
+            assert heights.climb_rate == 0.0 and abs(heights.height(now) - 2.0) < 0.4 * abs(jump)
+        else:
+            assert heights.stepped == -math.inf
+
+
 def test_for_a_while_after_a_jump_the_height_is_lost():
     heights, _ = flown(10.3, lambda t: 1.0 * (t > 10.0))
     assert heights.obstacle(10.25) is Obstacle.HEIGHT_JUMPED
@@ -142,8 +208,10 @@ def test_for_a_while_after_a_jump_the_height_is_lost():
 def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     heights = HeightEstimator()
     assert heights.height(0.0) is None and heights.obstacle(0.0) is None
+    assert heights.climb_rate == 0.0 and heights.correct(1.0, 0.0) == 1.0
     heights.take(50.0, None, 1.0)
     assert heights.height(1.0) is None and heights.altitude(1.0) == 50.0
+    assert heights.altitude(1.0 + HEIGHT_TIMEOUT) == 50.0
     heights.refer(1.5, 1.0)
     assert heights.height(1.0) == 1.5
     late = 1.01 + HEIGHT_TIMEOUT
@@ -205,6 +273,26 @@ def test_step_that_no_setpoint_explains_is_error_of_its_source(step, seconds):
             assert heights.correct(step, now) == pytest.approx(0.0, abs=0.35)
         assert heights.height(now) is None or abs(heights.height(now)) < 0.2
     assert heights.stepped == -math.inf
+
+
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_suspected_source_is_followed_by_the_fast_observer(side):
+    """It drifts by 0.45 m/s^2, which is no step: the slow observer alone lags by 0.73 m/s."""
+    heights = HeightEstimator()
+    for k in range(251):
+        now = k * PERIOD
+        drift = side * 0.45 * max(now - 10.0, 0.0)
+        heights.take(100.0, drift, now, acceleration=0.0)
+    assert heights.correct(drift, now) == pytest.approx(side * (0.45 * 2.0 / 3.0 + 0.25), abs=0.03)
+
+
+@pytest.mark.parametrize(('jump', 'counts'), [(12.5, False), (13.0, False), (13.5, True)])
+def test_for_three_seconds_a_suspected_source_proves_no_jump(jump, counts):
+    heights = HeightEstimator()
+    for k in range(round((jump + 0.2) / PERIOD)):
+        now = k * PERIOD  # suspicious until 10.3 s
+        heights.take(100.0 + 2.0 * (now > jump), 0.4 * (now > 10.0), now, acceleration=0.0)
+    assert (heights.stepped > jump) == counts
 
 
 @pytest.mark.parametrize('acceleration', [2.0, -2.0])

@@ -19,8 +19,9 @@ from __future__ import annotations
 from dataclasses import replace
 import math
 
-from flown import Follower, own, PARAMS, seen, step
+from flown import commanded, Follower, own, PARAMS, seen, step, STILL
 import numpy as np
+from numpy.typing import ArrayLike
 import pytest
 
 from flock_follower.geometry import Array
@@ -129,6 +130,26 @@ def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
     follower, decisions = fly(3.0, then_seen, then_received, follower)
     assert not follower.memory.looking
     assert not any('looks for' in warning for d in decisions for warning in d.warnings)
+
+
+def beside_silent(place: ArrayLike, velocity: ArrayLike = STILL, variance: float = 0.0) -> Array:
+    """Return the command beside a follower that was received for the last time 1.2 s ago."""
+    memory, _ = decide(Memory(), 0.0, seen(0.0))
+    silent = seen(0.0, place, velocity, 'behind', position_covariance=variance * np.eye(3),
+                  received=True, member=Member('follower'))
+    memory = memory._replace(flock={**memory.flock, 'behind': silent})
+    return commanded(decide(memory, 1.2, seen(1.2))[1])
+
+
+def test_silent_follower_hovers_where_it_stops_after_half_a_second() -> None:
+    place, velocity = np.array([-1.5, -0.2, 2.0]), np.array([0.6, 0.3, -0.2])
+    speed = float(np.linalg.norm(velocity))
+    stop = place + (0.5 + 0.5 * speed / (0.6 * PARAMS.a_max)) * velocity
+    assert beside_silent(place, velocity) == pytest.approx(beside_silent(stop))
+    assert beside_silent(place)[0] < beside_silent(stop)[0]
+    # Where it was is known up to two standard deviations.
+    assert beside_silent((-1.4, 0.0, 2.0), STILL, 0.01) == pytest.approx(
+        beside_silent((-1.2, 0.0, 2.0)))
 
 
 def test_pushed_back_it_passes_beside_silent_follower() -> None:
