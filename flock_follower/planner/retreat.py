@@ -38,7 +38,7 @@ from flock_follower.planner.vectors import difference, scalar_product
 
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
-DRIFT_SPEED = 0.1  # m/s by which the velocity of the autopilot is wrong without odometry
+DRIFT_SPEED = 0.2  # m/s by which the velocity of the autopilot is wrong without odometry
 UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
 STOPPING_TIME = 0.6  # s at its own speed that a vehicle goes on when odometry is lost
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer
@@ -111,7 +111,8 @@ def fallback_retreat(memory: Memory, scene: Scene,
         approach, speed = max(scalar_product(away, it.velocity),
                               scalar_product(away, it.later)), 0.0
         if approach > APPROACH_NOISE:
-            speed = approach - min(params.guarding.closing_speed(gap)[0], 0.0)
+            speed = approach + DRIFT_SPEED - min(
+                params.guarding.closing_speed(gap)[0], 0.0)
         if scalar_product(away, _newest_acceleration(n, memory)) > ACCELERATION_NOISE:
             now = scalar_product(away, n.velocity.tolist())
             own = max(-scalar_product(away, scene.me.velocity.tolist()), 0.0)

@@ -245,9 +245,9 @@ def test_one_that_returns_too_near_is_not_faded_in() -> None:
 
 
 @pytest.mark.parametrize(('velocity', 'acceleration', 'changes', 'retreat'), [
-    ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {}, (-0.3, 0.0, 0.0)),
+    ((-0.2, 0.0, 0.0), (0.0, 0.0, 0.0), {}, (-0.4, 0.0, 0.0)),  # and the drift
     ((0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {}, None),  # it goes away
-    ((0.3, 0.0, 0.0), (-0.7, 0.0, 0.0), {}, (-0.4, 0.0, 0.0)),  # it turns back
+    ((0.3, 0.0, 0.0), (-0.7, 0.0, 0.0), {}, (-0.5, 0.0, 0.0)),  # it turns back
     ((-2.0, 0.0, 0.0), (0.0, 0.0, 0.0), {}, (-0.5, 0.0, 0.0)),  # at most v_max
     ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'retreat_max': 0.0}, None),
     ((-0.3, 0.0, 0.0), (0.0, 0.0, 0.0), {'retreat_max': 0.15}, (-0.25, 0.0, 0.0)),
@@ -284,7 +284,7 @@ def test_the_retreat_is_from_the_nearest_one_that_comes() -> None:
     ahead = seen(0.0, (2.4, 0.0, 2.0), (-0.3, 0.0, 0.0), 'farthest')
     left = seen(0.0, (0.0, 2.0, 2.0), (0.0, -0.2, 0.0), 'nearer')
     found = fallback_from([ahead, left, goes], 0.0, PARAMS)
-    assert found is not None and found.velocity == pytest.approx([0.0, -0.2, 0.0], abs=0.01)
+    assert found is not None and found.velocity == pytest.approx([0.0, -0.4, 0.0], abs=0.01)
 
 
 @pytest.mark.parametrize(('distance', 'closing', 'turning', 'v_max'), [
@@ -294,6 +294,16 @@ def test_nobody_who_could_come_near_causes_no_retreat(distance: float, closing: 
                                                       turning: float, v_max: float) -> None:
     params = replace(PARAMS, v_max=v_max)
     assert fallback(distance, closing, turning, max(-closing, 0.0), params) is None
+
+
+@given(st.floats(1.4, 2.8), st.floats(0.11, 1.0), st.floats(0.5, 2.0))
+def test_drift_does_not_let_a_constant_approach_near(distance: float, closing: float,
+                                                     v_max: float) -> None:
+    found = fallback(distance, closing, 0.0, 0.0, replace(PARAMS, v_max=v_max))
+    assert found is not None
+    longest = min(PARAMS.retreat_max, RETREAT_TIME * v_max) + min(2.0 * closing, 3.0)
+    assert math.hypot(*found.velocity) >= min(
+        closing + DRIFT_SPEED, v_max, longest / ODOMETRY_GAP) - 1e-6
 
 
 @given(st.floats(1.4, 2.8), st.floats(-1.0, 1.0), st.floats(0.21, 2.0), st.floats(0.0, 1.0),

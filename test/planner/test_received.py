@@ -141,7 +141,7 @@ def beside_silent(place: ArrayLike, velocity: ArrayLike = STILL, variance: float
     return commanded(decide(memory, 1.2, seen(1.2))[1])
 
 
-def test_silent_follower_hovers_where_it_stops_after_half_a_second() -> None:
+def test_silent_follower_hovers_where_its_stop_ends() -> None:
     place, velocity = np.array([-1.5, -0.2, 2.0]), np.array([0.6, 0.3, -0.2])
     speed = float(np.linalg.norm(velocity))
     stop = place + (0.5 + 0.5 * speed / (0.6 * PARAMS.a_max)) * velocity
