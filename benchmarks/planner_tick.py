@@ -55,7 +55,7 @@ from flock_follower.planner.projection import Discs, nearest_in_order, optimum, 
 from flock_follower.planner.step import Inputs, Memory, step
 
 #: Numbers of neighbors: how many times the bare law a tick may take, by 99th percentiles.
-MOST_LAWS = {1: 8.0, 4: 12.0, 12: 15.0, 30: 18.0}
+MOST_LAWS = {1: 7.0, 4: 10.0, 12: 14.0, 30: 18.0}
 TICKS = 12  # of one flight
 NEAR, FAR = 1.0, 2.7  # m
 SPEED = 0.5  # m/s

@@ -55,14 +55,12 @@ class Neighborhood(NamedTuple):
     """The known neighbors, all at one time, and their relations to the ego vehicle."""
 
     flock: Sequence[Neighbor]
-    positions: Array
-    """Positions of the flock (n, 3), m."""
+    offsets: Array
+    """From the ego hull to those of the flock (n, 3), m."""
     velocities: Array
     """Velocities of the flock (n, 3), m/s."""
-    distances: Array
-    """Distances between the centers (n,), m."""
-    radii: Array
-    """Sums of the radii of each neighbor and the ego vehicle (n,), m."""
+    clearances: Sequence[float]
+    """Distances between the ego hull and the neighbors' (n,), m."""
     shares: Mapping[str, float]
     """1 with an edge, 0 without; in between while an edge fades in or out."""
     edges: frozenset[str]
@@ -72,14 +70,8 @@ class Neighborhood(NamedTuple):
     level: Neighbor | None
     """The neighbor whose altitude the vehicle follows; None: the altitude is held."""
 
-    @property
-    def clearances(self) -> Array:
-        """Return the distances between the ego hull and the neighbors' (n,), m."""
-        return np.maximum(self.distances - self.radii, 0.0)
-
-
 NOBODY = Neighborhood(
-    (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), {}, frozenset(), None, None)
+    (), np.zeros((0, 3)), np.zeros((0, 3)), (), {}, frozenset(), None, None)
 
 
 def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
@@ -91,10 +83,13 @@ def build_neighborhood(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
     :param flock: all present neighbors; at least one of them can be followed.
     """
     here, places = me.position.tolist(), [_place_at(me.stamp, n) for n in flock]
-    positions, distances = np.array(places), [math.dist(there, here) for there in places]
+    distances = [max(math.dist(there, here), GAP_MIN) for there in places]
+    gaps = [distance - (params.radius + n.member.radius) for n, distance in zip(flock, distances)]
+    positions, shortened = np.array(places), np.array([
+        [max(gap, GAP_MIN) / distance] for gap, distance in zip(gaps, distances)])
     flock = [n._replace(stamp=me.stamp, position=there) for n, there in zip(flock, positions)]
-    around = (flock, positions, np.array([n.velocity for n in flock]), np.array(distances),
-              np.array([params.radius + n.member.radius for n in flock]))
+    around = (flock, shortened * (positions - me.position), np.array([n.velocity for n in flock]),
+              [max(gap, 0.0) for gap in gaps])
     if len(flock) == 1:  # most often; one to avoid is never the only neighbor
         only = flock[0]
         return Neighborhood(*around, {only.name: 1.0}, frozenset([only.name]), only, only)
@@ -162,7 +157,7 @@ def reports(memory: Memory, neighbors: Neighborhood, params: PlannerParams) -> l
     """Return warnings about neighbors that cannot be followed, or whose position is unknown."""
     v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
-    for n, distance in zip(neighbors.flock, neighbors.clearances.tolist()):
+    for n, distance in zip(neighbors.flock, neighbors.clearances):
         edge = n.name in neighbors.edges
         speed = math.hypot(*n.velocity.tolist())
         if edge and speed > KEPT_UP_WITH * v_max:
@@ -219,19 +214,16 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
         return (np.zeros(3) if state is State.COAST else brake(
             velocity + retreating, params.strongest, params.brake_time_constant)), None
     flock = neighbors.flock
-    distances = np.maximum(neighbors.distances, GAP_MIN)
-    # From the ego hull to those of the neighbors.
-    shortened = np.maximum(distances - neighbors.radii, GAP_MIN) / distances
-    offsets = (neighbors.positions - me.position) * shortened[:, None]
     differences = neighbors.velocities - me.velocity
     if len(flock) == 1:
-        law = params.law.command(offsets, differences)
+        law = params.law.command(neighbors.offsets, differences)
     else:
         share = np.array([neighbors.shares[n.name] for n in flock])
         others = np.array([n.member.role == AVOID for n in flock])
-        law = graph_law(offsets, differences, share, others, params.law, params.a_max)
+        law = graph_law(
+            neighbors.offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
-    if float(neighbors.clearances.min()) ** 2 <= params.law.d0:
+    if min(neighbors.clearances) ** 2 <= params.law.d0:
         return law, None  # too near already: no fade-in
     if memory.params is not params and memory.params != params:
         fading = np.zeros(3) if memory.command is None else memory.command, me.stamp
