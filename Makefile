@@ -28,7 +28,7 @@
 # Try to break it
 #   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
 #   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
-#   make mutation  mutate gate, envelope, permission, activation, guard and filter, and list the mistakes that their tests would miss (45 minutes)
+#   make mutation  mutate gate, height, envelope, permission, activation, limits, guard and filter, and list the mistakes that their tests would miss (an hour)
 #   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (three minutes); ONLY=stale
 #
 # Settings, as in make fly SCENARIO=outdoor DURATION=20
@@ -178,7 +178,7 @@ seeded-bugs: setup
 	@$(RUN) test/seeded_bugs.py '$(ONLY)'
 
 mutation:
-	@echo 'takes about 45 minutes on two cores; the reports come one by one'
+	@echo 'takes about an hour on two cores; the reports come one by one'
 	@requirements/make_venv.sh .venv-mutation requirements/mutation.txt
 	@.ci/mutation
 

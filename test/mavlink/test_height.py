@@ -54,6 +54,7 @@ def test_pressures_are_altitudes_of_the_standard_atmosphere():
     assert pressure_altitude(954.61) == pytest.approx(500.0, abs=0.5)  # ISO 2533
     assert pressure_altitude(1074.78) == pytest.approx(-500.0, abs=0.5)
     assert all(math.isnan(pressure_altitude(p)) for p in (0.0, -1.0, 2000.0, math.nan, math.inf))
+    assert all(math.isfinite(pressure_altitude(p)) for p in (0.5, 1999.5))
 
 
 def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():
@@ -89,9 +90,9 @@ def test_two_altitudes_far_apart_are_a_leap_of_the_sensor():
 def test_first_rate_of_another_source_is_compared_if_settled(seconds, before, settled, rate):
     heights = HeightEstimator()
     for k in range(round(seconds / PERIOD)):
-        heights.take(0.05 * k, None, k * PERIOD)  # climbs at 1 m/s
+        heights.take(0.05 * k, None, 10.0 + k * PERIOD)  # climbs at 1 m/s
     assert before - 0.1 < heights.climb_rate < before + 0.1
-    heights.take(seconds, rate, seconds)
+    heights.take(seconds, rate, 10.0 + seconds)
     assert heights.climb_rate == pytest.approx(before if settled else rate, abs=0.03)
 
 
@@ -224,14 +225,16 @@ def test_a_height_that_is_old_or_has_no_reference_is_unknown():
 
 @pytest.mark.parametrize('referenced', [False, True])
 @pytest.mark.parametrize('first', [1, 4, 12])
-def test_other_sensor_takes_over_without_jump_of_height(first, referenced):
+@pytest.mark.parametrize('sensors', ['DISTANCE_SENSOR SCALED_PRESSURE',
+                                     'SCALED_PRESSURE DISTANCE_SENSOR'])
+def test_other_sensor_takes_over_without_jump_of_height(first, referenced, sensors):
     # A bridge restarted in flight: the rangefinder's messages come before the barometer's.
     heights = HeightEstimator()
     for k in range(200):
-        now, barometer = k * PERIOD, k >= first
+        now, other = k * PERIOD, k >= first
         rate = -0.7 if k > 2 else None  # the first odometry comes later than the first height
-        heights.take((490.0 if barometer else 0.0) + 2.0 - 0.7 * now, rate, now,
-                     'SCALED_PRESSURE' if barometer else 'DISTANCE_SENSOR')
+        heights.take((490.0 if other else 0.0) + 2.0 - 0.7 * now, rate, now,
+                     sensors.split()[other])
         if k == 0 and referenced:
             heights.refer(2.0, now)
         assert heights.correct(-0.7, now) == pytest.approx(-0.7, abs=0.1)
