@@ -255,9 +255,9 @@ def test_a_jump_that_the_velocity_does_not_match_is_taken_out(speed):
 @pytest.mark.parametrize(('surprise', 'jumped'), [(0.29, False), (0.31, True)])
 def test_without_a_gap_a_jump_is_more_than_position_jump(before, elapsed, surprise, jumped):
     path = Path()
-    path.take(np.zeros(3), None if before is None else np.array(before), 1.0)
-    path.take(np.array([0.0, 0.0, surprise]), np.zeros(3), 1.0 + elapsed)
-    assert path.position[2] == pytest.approx(0.0 if jumped else surprise)
+    path.take(np.ones(3), None if before is None else np.array(before), 1.0)
+    path.take(np.array([1.0, 1.0, 1.0 + surprise]), np.zeros(3), 1.0 + elapsed)
+    assert path.position == pytest.approx(np.array([1.0, 1.0, 1.0 if jumped else 1.0 + surprise]))
 
 
 def test_a_displacement_within_the_window_follows_a_curve() -> None:
