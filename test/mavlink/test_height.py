@@ -84,8 +84,7 @@ def test_a_climb_is_followed_whatever_the_odometry_says_of_it(rate):
 @pytest.mark.parametrize('lacks', [0.0, 0.3, -0.3])
 def test_other_source_is_corrected_in_seconds_hardly_disturbed(lacks):
     heights, _ = flown(20.0, altitude=lambda t: 100.0 + lacks * t)
-    assert heights.correct(2.0, 20.0) == pytest.approx(2.0 + lacks, abs=0.05)
-    assert heights.correct(2.0, 20.0 + HEIGHT_TIMEOUT) == 2.0
+    assert heights.correct(2.0) == pytest.approx(2.0 + lacks, abs=0.05)
 
 
 @pytest.mark.parametrize('back', [11.5, 14.5])  # s: in the descent, after the touchdown
@@ -99,7 +98,7 @@ def test_odometry_that_returns_has_its_error_of_before(back, lacks):
         return -0.6 * min(max(t - 10.0, 0.0), 4.0)
     heights, _ = flown(back + 0.1, falls, lambda t: (
         None if 10.3 < t < back else sinks(t) - lacks))
-    assert heights.correct(sinks(back) - lacks, back + 0.1) == pytest.approx(
+    assert heights.correct(sinks(back) - lacks) == pytest.approx(
         sinks(back), abs=0.1)
 
 
@@ -144,7 +143,7 @@ def test_other_sensor_takes_over_without_jump_of_height(first, referenced):
                      'SCALED_PRESSURE' if barometer else 'DISTANCE_SENSOR')
         if k == 0 and referenced:
             heights.refer(2.0, now)
-        assert heights.correct(-0.7, now) == pytest.approx(-0.7, abs=0.1)
+        assert heights.correct(-0.7) == pytest.approx(-0.7, abs=0.1)
         if referenced:
             assert heights.height(now) == pytest.approx(2.0 - 0.7 * now, abs=0.15)
     assert math.isinf(heights.stepped)
@@ -166,7 +165,7 @@ def test_barometer_jump_corrects_climb_by_its_bound_at_most():
     for k in range(100):
         now = k * PERIOD
         heights.take(2.0 + (30.0 if k >= 40 else 0.0) + 5.0 * max(now - 2.0, 0.0), 0.0, now)
-        assert abs(heights.correct(0.0, now)) <= MAX_CORRECTION
+        assert abs(heights.correct(0.0)) <= MAX_CORRECTION
 
 
 @pytest.mark.parametrize('seconds', [0.0, 0.4])
@@ -180,7 +179,7 @@ def test_step_that_no_setpoint_explains_is_error_of_its_source(step, seconds):
         if k == 40:
             heights.refer(0.0, now)
         if now > 10.3 + 2.0 * seconds:  # beyond MAX_CORRECTION, too
-            assert heights.correct(step, now) == pytest.approx(0.0, abs=0.35)
+            assert heights.correct(step) == pytest.approx(0.0, abs=0.35)
         assert heights.height(now) is None or abs(heights.height(now)) < 0.2
     assert heights.stepped == -math.inf
 
@@ -190,7 +189,7 @@ def test_steady_source_is_not_blamed_if_setpoints_are_not_flown(acceleration):
     heights = HeightEstimator()
     for k in range(100):
         heights.take(100.0, 0.0, k * PERIOD, acceleration=acceleration)
-        assert heights.correct(0.0, k * PERIOD) == 0.0
+        assert heights.correct(0.0) == 0.0
 
 
 def test_climb_that_setpoints_explain_is_no_error_of_its_source():
@@ -200,7 +199,83 @@ def test_climb_that_setpoints_explain_is_no_error_of_its_source():
         rate += PERIOD * acceleration
         heights.take(100.0 + max(k - 45, 0) * PERIOD * rate, rate, k * PERIOD,
                      acceleration=acceleration)
-    assert heights.correct(rate, 99 * PERIOD) == pytest.approx(rate, abs=0.05)
+    assert heights.correct(rate) == pytest.approx(rate, abs=0.05)
+
+
+def sunk(t):
+    """Return the height lost by the divergence of ``diverging``, m."""
+    late = max(t - 1.4, 0.0)
+    return 0.5 * min(max(t, 0.0), 1.4) ** 2 + 1.4 * late
+
+
+def diverging(t):
+    return min(max(t, 0.0), 1.4)
+
+
+@pytest.mark.parametrize('seed', range(8))
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_error_of_a_rate_that_stays_constant_is_found_soon(sign, seed):
+    """An autopilot that fuses a diverging rate moves so that the rate stays as it was."""
+    rng, heights = np.random.default_rng(seed), HeightEstimator()
+    for k in range(260):
+        now = k * PERIOD
+        heights.take(100.0 - sign * sunk(now - 10.0) + NOISE * rng.normal(), 0.0, now,
+                     acceleration=0.0)
+        if k == 40:
+            heights.refer(0.0, now)
+        if now > 11.4:  # with the slow observer alone a fifth
+            assert -sign * heights.correct(0.0) > 0.35 * diverging(now - 10.0)
+            assert heights.height(now) == pytest.approx(-sign * sunk(now - 10.0), abs=0.4)
+    assert heights.correct(0.0) == pytest.approx(-sign * 1.4, abs=0.2)
+    assert heights.stepped == -math.inf
+
+
+def test_a_vehicle_that_follows_the_correction_is_no_step():
+    """ArduCopter: the corrected rate is the one that it keeps, so odometry's rate rises."""
+    rng, heights, climbed = np.random.default_rng(3), HeightEstimator(), 0.0
+    for k in range(320):
+        now = k * PERIOD
+        true = -1.2 * (10.0 < now <= 11.0) if now <= 11.0 else -1.2 - heights.correct(0.0)
+        climbed += PERIOD * true
+        heights.take(100.0 + climbed + NOISE * rng.normal(), true + 1.2 * (now > 10.0), now,
+                     acceleration=0.0)
+        assert now < 11.0 or abs(heights.correct(0.0) + 1.2) < 1.25
+    assert heights.correct(0.0) == pytest.approx(-1.2, abs=0.15)
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('after', [-2.5, -0.1, 0.0, 0.1, 0.3, 1.0, 2.5])  # s from rate to sensor
+@pytest.mark.parametrize(('jump', 'step'), [(1.0, 1.0), (1.0, -1.0), (-2.0, 3.0), (3.0, 0.7)])
+def test_two_faults_within_suspicion_are_told_apart(jump, step, after, seed):
+    rng, heights = np.random.default_rng(seed), HeightEstimator()
+    for k in range(320):  # the vehicle hovers
+        now = k * PERIOD
+        heights.take(100.0 + jump * (now > 10.0 + after) + NOISE * rng.normal(),
+                     step * (now > 10.0), now, acceleration=0.0)
+        if k == 40:
+            heights.refer(0.0, now)
+        assert now < 13.0 or heights.correct(step) == pytest.approx(0.0, abs=0.3)
+        assert heights.height(now) is None or abs(heights.height(now)) < 0.6
+    assert heights.stepped == pytest.approx(10.0 + after, abs=0.3)
+    assert heights.height(now) == pytest.approx(0.0, abs=0.3)
+
+
+def test_error_outlasts_the_sensor_and_follows_steps():
+    heights, _ = flown(20.0, altitude=lambda t: 100.0 + 0.3 * t)
+    known, now = heights.correct(0.0), 20.0
+    for k in range(200):
+        now += PERIOD
+        heights.take_rate(1.0 * (k > 100), now, 0.0)
+    assert heights.height(now) is None and heights.is_silent(now)
+    assert heights.correct(1.0) == pytest.approx(known, abs=0.01)
+    heights.refer(None, now)
+    assert heights.correct(1.0) == 1.0  # in the next flight
+
+
+def test_first_rate_in_a_climb_is_no_error():
+    heights = HeightEstimator()
+    heights.take(50.0, 1.0, 0.0)
+    assert heights.correct(1.0) == 1.0
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
