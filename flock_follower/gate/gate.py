@@ -211,14 +211,10 @@ class Gate:
 
     def take_height(self, altitude: float, now: float, sensor: str = '') -> str:
         """Take an altitude, m, of a barometer or another sensor; return '' or the refusal."""
-        # Also of an invalid source: a constant error is estimated and removed.
-        velocity = None if self.relative.reckoning else self.motion.best_velocity(
-            self.limits, now)
-        refused = self.heights.take(altitude, None if velocity is None else float(
-            velocity.vector[2]), now, sensor, self._disturbance.expected_climb)
+        refused = self.heights.take(
+            altitude, self._climb_rate(now), now, sensor, self._disturbance.expected_climb)
         height = self.heights.altitude(now)
-        # The autopilot obeys with the velocity that was forwarded, which has no such error.
-        self.motion.climb_rate_error = self.corrected_climb_rate(0.0, now) * self.autopilot.fused
+        self._use_correction()
         if self.heights.stepped == now and now - self.heights.leapt <= STEP_TIME:
             # Not the odometry: its velocity errs more slowly.
             self.motion.forget_heights()
@@ -226,10 +222,20 @@ class Gate:
             self.motion.take_height(height, now)
         return refused
 
-    def corrected_climb_rate(self, climb_rate: float, now: float) -> float:
+    def _climb_rate(self, now: float) -> float | None:
+        """Return the uncorrected vertical velocity, m/s; None if unknown."""
+        # Also of an invalid source: a constant error is estimated and removed.
+        velocity = None if self.relative.reckoning else self.motion.best_velocity(
+            self.limits, now)
+        return None if velocity is None else float(velocity.vector[2])
+
+    def _use_correction(self) -> None:
+        # The autopilot obeys with the velocity that was forwarded, which has no such error.
+        self.motion.climb_rate_error = self.corrected_climb_rate(0.0) * self.autopilot.fused
+
+    def corrected_climb_rate(self, climb_rate: float) -> float:
         """Return a vertical velocity of odom, m/s, minus its error by the barometer."""
-        by_odom = self.motion.source == ODOM
-        return self.heights.correct(climb_rate, now) if by_odom else climb_rate
+        return self.heights.correct(climb_rate) if self.motion.source == ODOM else climb_rate
 
     def take_attitude(self, quaternion: Array, rates: Array, time: float,
                       now: float) -> OdometryState | None:
@@ -332,6 +338,9 @@ class Gate:
     def _observe(self, report: VehicleReport, withheld: str, engaged: bool, distrusted: bool,
                  now: float) -> Situation:
         """Update the estimates to ``now``, s, and return the situation."""
+        if self.heights.is_silent(now):
+            self.heights.take_rate(self._climb_rate(now), now, self._disturbance.expected_climb)
+            self._use_correction()
         known = self.motion.compare(
             self.limits, engaged, distrusted, self.autopilot.fused, now)
         place, command, displaced = self.place(now), self.commands.newest, self.motion.displaced

@@ -22,9 +22,10 @@ whose error it estimates.
 
 Both can fail. If the sensor jumps and that velocity does not (a gust, a door, a table below), the
 reference is shifted by the jump. If that velocity changes and no setpoint explains it (odometry
-that diverges), the change is its error at once, and for a while a second observer, which is
-faster, limits the estimate. If another sensor takes over, its altitudes are shifted: they have
-another zero.
+that diverges), the change is its error at once. If it errs unnoticed (an autopilot that fuses it
+keeps it constant), a second observer, which is faster, contradicts the first one, and replaces its
+error for a while. If the sensor is lost, the error stays, and still follows the changes of that
+velocity. If another sensor takes over, its altitudes are shifted: they have another zero.
 """
 
 from __future__ import annotations
@@ -41,16 +42,21 @@ from flock_follower.ranges import first_reason
 BANDWIDTH: Final[float] = 1.0
 #: 1/s, of the second observer; that noise leaves 0.05 m/s in its rate.
 FAST_BANDWIDTH: Final[float] = 3.0
-#: While a source is suspected, the errors of both observers differ by at most this, m/s: 5 sigma
-#: of the fast one.
+#: If the errors of both observers differ by more than this, m/s, 5 sigma of the fast one, the fast
+#: one counts for SUSPICION_TIME.
 RATE_TOLERANCE: Final[float] = 0.25
+#: Altitudes by both observers differ by at most this, m: 4 sigma of the fast one.
+HEIGHT_TOLERANCE: Final[float] = 0.15
 #: A climb rate that changes by more than this, m/s, without explanation has stepped. A hover
 #: thrust that is wrong by 1 m/s^2 leaves 0.42 m/s unexplained.
 RATE_STEP: Final[float] = 0.5
-#: From this unexplained change on, m/s, the source is suspected ...
+#: From this unexplained change on, m/s, the source is suspected, so that only a large jump of the
+#: sensor counts ...
 SUSPICIOUS_CHANGE: Final[float] = 0.3
 #: ... for this long, s.
 SUSPICION_TIME: Final[float] = 3.0
+#: A vehicle that follows a changed correction overshoots: by so many times the change.
+RESPONSE: Final[float] = 2.0
 #: Unexplained changes are forgotten with this time constant, s: a disturbance is estimated then.
 CHANGE_MEMORY: Final[float] = 1.0
 #: Largest vertical acceleration of a vehicle whose setpoints are not known, m/s^2.
@@ -60,7 +66,7 @@ PROOF_TIME: Final[float] = 10.0
 #: s: until then the observer does not know the vertical velocity by the sensor alone.
 SETTLING: Final[float] = 3.0
 #: m/s: more than this is not corrected beyond the steps of a source: the sensor may be wrong.
-MAX_CORRECTION: Final[float] = 1.0
+MAX_CORRECTION: Final[float] = 2.0
 #: A height older than this, s, is not known any more.
 HEIGHT_TIMEOUT: Final[float] = 1.0
 #: The sensor has jumped if its newest samples differ on average by more than this from the height
@@ -69,11 +75,15 @@ STEP: Final[float] = 0.25
 #: They differ by more than this from the samples before, too, m: a climb that the other source
 #: denies grows more slowly.
 STEP_CHANGE: Final[float] = 0.2
+#: As much while another source is suspected, m: an error of 2.5 m/s grows more slowly.
+SUSPECTED_CHANGE: Final[float] = 0.5
 #: Newest samples are those of this time, s. Meanwhile the observer follows a sixth of a jump of
 #: 0.3 m.
 STEP_TIME: Final[float] = 0.2
 #: Least number of newest samples.
 STEP_SAMPLES: Final[int] = 3
+#: A jump that was noticed may go on for this long, s: that of a door.
+REST_TIME: Final[float] = 0.3
 #: For this long, s, after a jump the vehicle brakes.
 STEP_PAUSE: Final[float] = 1.0
 #: Change between two altitudes, m, that the sensor alone can make: a table, a wall, a door.
@@ -103,13 +113,16 @@ class RateSteps:
         """When the last change was suspicious, s."""
         self._changed = 0.0
         self._unexplained = 0.0
+        self._corrected = 0.0
 
-    def take(self, change: float, elapsed: float, acceleration: float | None,
-             now: float) -> float:
+    def take(self, change: float, elapsed: float, acceleration: float | None, now: float,
+             corrected: float = 0.0) -> float:
         """
         Take a change of the climb rate, m/s, in a time, s; return its step, m/s, or 0.
 
         :param acceleration: the vertical one that is expected, m/s^2; None if unknown.
+        :param corrected: by how much the correction of the rate has changed, m/s: an autopilot
+            that fuses the corrected rate changes its own by as much the other way.
         """
         largest = FASTEST_CHANGE * elapsed
         expected = min(max(change, -largest), largest) if acceleration is None else (
@@ -117,12 +130,14 @@ class RateSteps:
         kept = math.exp(-elapsed / CHANGE_MEMORY)
         self._changed = kept * self._changed + change
         self._unexplained = kept * self._unexplained + change - expected
+        self._corrected = kept * self._corrected + RESPONSE * corrected
         # A vehicle that does not obey is no error of the source, which has not changed then.
         step = min(max(self._unexplained, min(self._changed, 0.0)), max(self._changed, 0.0))
+        step -= min(max(-self._corrected, min(step, 0.0)), max(step, 0.0))
         self.suspected = now if abs(step) > SUSPICIOUS_CHANGE else self.suspected
         if abs(step) <= RATE_STEP:
             return 0.0
-        self._changed = self._unexplained = 0.0
+        self._changed = self._unexplained = self._corrected = 0.0
         return step
 
 
@@ -135,6 +150,10 @@ class _Sample(NamedTuple):
     """Altitude minus the expected one, m."""
     error: float
     """Error of the other source's climb rate before the sample, m/s."""
+    expected: float
+    """The expected altitude, m."""
+    path: float
+    """Integral of the other source's climb rate, m."""
 
 
 class _Observer:
@@ -170,7 +189,10 @@ class HeightEstimator:
         self._slow, self._fast = _Observer(BANDWIDTH), _Observer(FAST_BANDWIDTH)
         self._source_error: float | None = None  # when the other source was lost last, m/s
         self._reported: float | None = None
-        self._time = self._began = -math.inf
+        self._began = math.inf
+        self._time = self._rated = self._contradicted = -math.inf
+        self._path = 0.0  # integral of the other source's climb rate, m
+        self._before = 0.0  # error at the newest climb rate, m/s
         self._sensor = ''
         self._zero = 0.0  # altitude of the sensor at altitude 0
         self._reference: float | None = None
@@ -191,8 +213,7 @@ class HeightEstimator:
         if refused := first_reason((not abs(altitude) <= SANE, 'not plausible'),
                                    (not elapsed > 0.0, 'not newer')):
             return refused
-        if climb_rate is not None and not abs(climb_rate) <= FASTEST_OWN:
-            climb_rate = None
+        self.take_rate(climb_rate, now, acceleration)
         if sensor != self._sensor:
             before, self._sensor = self.altitude(now), sensor
             self._zero = 0.0 if before is None else altitude - before
@@ -203,47 +224,71 @@ class HeightEstimator:
         self._newest = altitude
         if elapsed > HEIGHT_TIMEOUT:
             # A sensor that returns is used again, with the same reference.
-            self._set(altitude, 0.0)
+            self._set(altitude, 0.0 if self._reported is None else self._slow.error)
             self._began = now
         else:
-            self._follow(altitude, climb_rate, elapsed, now, acceleration)
-        self._reported, self._time = climb_rate, now
+            self._follow(altitude, elapsed, now)
+        self._time = now
         return ''
+
+    def take_rate(self, climb_rate: float | None, now: float,
+                  acceleration: float | None = None) -> None:
+        """Take the climb rate, m/s, of the other source, which may step; see ``take``."""
+        slow, fast, reported = self._slow, self._fast, self._reported
+        if climb_rate is not None and not abs(climb_rate) <= FASTEST_OWN:
+            climb_rate = None
+        if climb_rate is None or reported is None:
+            if climb_rate is not reported:
+                slow.error = fast.error = self._error_without(climb_rate, now)
+        else:
+            step = self._steps.take(climb_rate - reported, now - self._rated, acceleration, now,
+                                    slow.error - self._before)
+            slow.error, fast.error, self._proven = (
+                error - step for error in (slow.error, fast.error, self._proven))
+            if step:
+                self._samples = deque(sample._replace(
+                    error=sample.error - step,
+                    path=sample.path - step * (self._time - sample.time),
+                ) for sample in self._samples)
+        self._before, self._rated, self._reported = slow.error, now, climb_rate
 
     def _set(self, altitude: float, error: float) -> None:
         for observer in (self._slow, self._fast):
             observer.altitude, observer.error = altitude, error
         self._samples.clear()
 
-    def _follow(self, altitude: float, climb_rate: float | None, elapsed: float,
-                now: float, acceleration: float | None) -> None:
-        slow, fast, reported = self._slow, self._fast, self._reported
-        if climb_rate is None or reported is None:
-            if climb_rate is not reported:
-                slow.error = fast.error = self._error_without(climb_rate, now)
-        else:
-            step = self._steps.take(climb_rate - reported, elapsed, acceleration, now)
-            slow.error, fast.error, self._proven = (
-                error - step for error in (slow.error, fast.error, self._proven))
+    def _follow(self, altitude: float, elapsed: float, now: float) -> None:
+        slow, fast, climb_rate = self._slow, self._fast, self._reported
         self._proven += (slow.error - self._proven) * min(elapsed / PROOF_TIME, 1.0)
-        before = slow.error
+        error = slow.error
         difference = slow.step(altitude, climb_rate or 0.0, elapsed)
         fast.step(altitude, climb_rate or 0.0, elapsed)
-        self._samples.append(_Sample(now, difference, before))
+        self._path += elapsed * (climb_rate or 0.0)
+        self._samples.append(_Sample(now, difference, error, altitude - difference, self._path))
         while now - self._samples[0].time > 2.0 * STEP_TIME:
             self._samples.popleft()
         if climb_rate is None:
             return
-        suspected = now - self._steps.suspected < SUSPICION_TIME
-        if not suspected and self._has_jumped(now):
+        contradicted = now - self._contradicted  # the beginning may be that of a jump
+        doubtful = now - self._steps.suspected < SUSPICION_TIME or (
+            STEP_TIME < contradicted < SUSPICION_TIME)
+        if self._has_jumped(SUSPECTED_CHANGE if doubtful else STEP_CHANGE, now):
+            before = [sample for sample in self._samples if sample.time < self.leapt]
+            last = before[-1] if before else self._samples[0]
             self.stepped = now
-            self._set(altitude, self._samples[0].error)
+            self._set(altitude, last.error)
             if self._reference is not None:
-                self._reference += difference
+                self._reference += altitude - last.expected - (self._path - last.path) - (
+                    last.error * (now - last.time))
+            if contradicted <= STEP_TIME:
+                self._contradicted = -math.inf
             return
-        if suspected:
-            slow.error = min(max(slow.error, fast.error - RATE_TOLERANCE),
-                             fast.error + RATE_TOLERANCE)
+        # What follows a jump is most often the rest of it.
+        if abs(fast.error - slow.error) > RATE_TOLERANCE and (
+                now - max(self.leapt, self.stepped + REST_TIME) > STEP_TIME):
+            self._contradicted = now
+        if now - self._contradicted < SUSPICION_TIME:
+            slow.error = fast.error
 
     def _error_without(self, climb_rate: float | None, now: float) -> float:
         """Return the error, m/s, after the other source was lost (None), or has returned."""
@@ -256,37 +301,45 @@ class HeightEstimator:
             return self._source_error
         return self.climb_rate - climb_rate if now - self._began >= SETTLING else 0.0
 
-    def _has_jumped(self, now: float) -> bool:
+    def _has_jumped(self, change: float, now: float) -> bool:
         new = [sample.difference for sample in self._samples if now - sample.time <= STEP_TIME]
         old = [sample.difference for sample in self._samples if now - sample.time > STEP_TIME]
         if len(new) < STEP_SAMPLES or not old:
             return False
         mean = math.fsum(new) / len(new)
-        return abs(mean) > STEP and abs(mean - math.fsum(old) / len(old)) > STEP_CHANGE
+        return abs(mean) > STEP and abs(mean - math.fsum(old) / len(old)) > change
 
     @property
     def climb_rate(self) -> float:
         """Return the vertical velocity of the vehicle by the sensor, m/s."""
         return (self._reported or 0.0) + self._slow.error
 
-    def correct(self, climb_rate: float, now: float) -> float:
+    def correct(self, climb_rate: float) -> float:
         """Return a vertical velocity of odometry, m/s, corrected: beyond its steps by a limit."""
-        known = self._reported is not None and now - self._time <= HEIGHT_TIMEOUT
         rest = self._slow.error - self._proven
         error = self._proven + min(max(rest, -MAX_CORRECTION), MAX_CORRECTION)
-        return climb_rate + (error if known else 0.0)
+        # A sensor that is lost takes nothing back: an error of the source outlasts it.
+        return climb_rate + (0.0 if self._reported is None else error)
 
     def altitude(self, now: float) -> float | None:
         """Return the altitude by the sensor, m, at ``now``; None if none is known."""
         if now - self._time > HEIGHT_TIMEOUT:
             return None
-        return self._slow.altitude + max(now - self._time, 0.0) * self.climb_rate
+        newest = self._slow.altitude
+        if now - self.leapt > STEP_TIME:
+            newest = min(max(newest, self._fast.altitude - HEIGHT_TOLERANCE),
+                         self._fast.altitude + HEIGHT_TOLERANCE)
+        return newest + max(now - self._time, 0.0) * self.climb_rate
 
     def height(self, now: float) -> float | None:
         """Return the height above the reference, m, at ``now``; None if none is known."""
         altitude = self.altitude(now)
         known = altitude is not None and self._reference is not None
         return altitude - self._reference if known else None  # type: ignore[operator]
+
+    def is_silent(self, now: float) -> bool:
+        """Return whether the sensor is silent, but was received before."""
+        return STEP_TIME < now - self._time < math.inf
 
     @property
     def has_reference(self) -> bool:
@@ -296,6 +349,8 @@ class HeightEstimator:
     def refer(self, height: float | None, now: float) -> None:
         """Set the reference so that the present height is a given height, m; None forgets it."""
         altitude = self.altitude(now)
+        if height is None and altitude is None:  # the next flight begins without an error
+            self._proven = self._slow.error = self._fast.error = 0.0
         self._reference = None if height is None or altitude is None else altitude - height
         self._referred = self.has_reference
 

@@ -166,7 +166,7 @@ class Bridge:
         if self.forwarder is None:
             return ''
         east, north, up = state.velocity.tolist()
-        velocity = np.array([east, north, self.gate.corrected_climb_rate(up, now)])
+        velocity = np.array([east, north, self.gate.corrected_climb_rate(up)])
         return self.forwarder.take(state._replace(velocity=velocity), time, now)
 
     def velocity_fault(self, now: float) -> str:

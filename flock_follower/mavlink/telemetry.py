@@ -155,8 +155,10 @@ class Telemetry:
         elif kind == 'ATTITUDE_QUATERNION':
             self._attitude(message, now)
         elif kind == 'SCALED_PRESSURE':
-            self.sensor_altitude = SensorAltitude(
-                now, pressure_altitude(message.press_abs), kind)
+            altitude, known = pressure_altitude(message.press_abs), self.sensor_altitude
+            # The same number again is no measurement: a sensor that is slower, or stuck.
+            if known is None or altitude != known.altitude:
+                self.sensor_altitude = SensorAltitude(now, altitude, kind)
         elif kind == 'DISTANCE_SENSOR':
             self._distance(message, now)
         elif self.dialect is not None and message.get_msgId() == self.dialect.estimator_status:

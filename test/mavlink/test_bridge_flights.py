@@ -61,23 +61,29 @@ def test_two_whole_flights_need_only_the_services(personality):
 # Without GPS.
 
 
+def forwarded_error(flight):
+    """Return the mean error of the forwarded vertical velocity in the next second, m/s."""
+    errors = []
+    for _ in range(20):
+        flight.fly(0.05)
+        reported = [m for _, m in flight.received if m.get_type() == 'ODOMETRY'][-1]
+        errors.append(-reported.vz - flight.vehicle.velocity[2])  # it is almost level
+    return float(np.mean(errors))
+
+
 def test_forwarded_climb_is_corrected_by_barometer():
     """The autopilot's height follows it, in the hold mode too: on real ones to the ground."""
     flight = forwarding(Flight(**without_gps('px4')))
     flight.engage()
     flight.odom_error[2] = -0.8
     flight.fly(4.0)
-    errors = []
-    for _ in range(20):
-        flight.fly(0.05)
-        reported = [m for _, m in flight.received if m.get_type() == 'ODOMETRY'][-1]
-        errors.append(-reported.vz - flight.vehicle.velocity[2])  # it is almost level
-    assert np.mean(errors) == pytest.approx(0.0, abs=0.1)
+    assert forwarded_error(flight) == pytest.approx(0.0, abs=0.1)
 
 
 @BOTH
 @pytest.mark.parametrize(('step', 'seconds', 'least', 'most'), [
-    (0.5, 0.0, 0.7, 2.0), (1.0, 0.0, 1.3, 2.0), (-3.0, 0.0, 1.9, 2.4), (2.0, 0.5, 0.35, 2.0)])
+    (0.5, 0.0, 0.7, 2.0), (1.0, 0.0, 1.3, 2.0), (-3.0, 0.0, 1.9, 2.4), (2.0, 0.5, 0.35, 2.0),
+    (1.4, 1.4, 0.4, 2.0)])
 def test_diverging_climb_of_fused_odometry_ends_flight_in_time(
         personality, step, seconds, least, most):
     """The vehicle, which held the wrong velocity, was on the ground after 2 s."""
@@ -94,6 +100,55 @@ def test_diverging_climb_of_fused_odometry_ends_flight_in_time(
             heights.append(flight.vehicle.position[2])
     assert not flight.bridge.gate.permission.streams
     assert least < min(heights) and max(heights) < most
+
+
+@BOTH
+@pytest.mark.parametrize('before', [0.5, -0.5])  # s, from the odometry's error to the loss
+def test_error_of_fused_climb_is_corrected_without_barometer(personality, before):
+    """In the hold mode, too: both sank at 1 m/s from one second after the loss on."""
+    flight = forwarding(Flight(personality, **without_gps(personality)))
+    flight.engage()
+    flight.fly(3.0)
+    lost = Fault('drop', flight.now + max(before, 0.0), direction='sent',
+                 message='SCALED_PRESSURE')
+    flight.autopilot._sent._faults.append(lost)
+    flight.fly(max(-before, 0.0))
+    flight.odom_error[2] = 1.0
+    flight.fly_until(lambda: not flight.bridge.gate.permission.streams, 6.0)
+    assert not flight.bridge.gate.permission.streams and flight.vehicle.position[2] > 1.0
+    assert forwarded_error(flight) == pytest.approx(0.0, abs=0.25)
+
+
+@BOTH
+def test_stuck_barometer_corrects_nothing_and_is_lost(personality):
+    """It denied a climb, which the vehicle then flew faster."""
+    flight = forwarding(Flight(personality, **without_gps(personality)))
+    flight.engage()
+    flight.fly(3.0)
+    flight.autopilot.barometer.heights = lambda *_: np.array([490.0])
+    for _ in range(12):
+        flight.planner = np.array([0.0, 0.0, 2.0 * (0.4 - flight.vehicle.velocity[2])])
+        flight.fly(0.1)
+    assert flight.reason == 'height stale'
+    assert forwarded_error(flight) == pytest.approx(0.0, abs=0.1)
+
+
+@BOTH
+@pytest.mark.parametrize('after', [-0.5, 0.1, 1.0])  # s, from the odometry to the barometer
+def test_two_faults_of_the_height_do_not_end_on_the_ground(personality, after):
+    flight = forwarding(Flight(personality, **without_gps(personality)))
+    flight.odom_displacement = np.zeros(3)
+    flight.engage()
+    begun, heights, measured = flight.now + 3.0, [], flight.autopilot.barometer.heights
+    flight.autopilot.barometer.heights = lambda true, now: measured(true, now) + 2.0 * (
+        now > begun + after)
+    while flight.now < begun + 6.0:
+        flight.odom_error[2] = 2.0 * (flight.now > begun)
+        flight.planner = limit_norm(-2.0 * (flight.vehicle.velocity + flight.odom_error), 2.0)
+        flight.fly(0.1)
+        if flight.bridge.gate.permission.streams:
+            heights.append(flight.vehicle.position[2])
+    assert min(heights) > 0.8 and max(heights) < 2.5
 
 
 @pytest.mark.parametrize(('personality', 'action'), [
