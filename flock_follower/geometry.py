@@ -31,9 +31,8 @@ The frames of MAVLink are in ``ned``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -212,8 +211,7 @@ def skew(vector: ArrayLike) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-@dataclass(frozen=True)
-class Transform:
+class Transform(NamedTuple):
     """
     A rigid transform ``T_a_b``: coordinates in frame b to coordinates in frame a.
 
@@ -221,8 +219,8 @@ class Transform:
     ``T_a_b @ T_b_c`` composes to ``T_a_c``; ``T_a_b.apply(p_b)`` is ``p_a``, shape (..., 3).
     """
 
-    rotation: Array = field(default_factory=lambda: np.eye(3))
-    translation: Array = field(default_factory=lambda: np.zeros(3))
+    rotation: Array = np.broadcast_to(np.eye(3), (3, 3))  # read-only: all identities share it
+    translation: Array = np.broadcast_to(np.zeros(3), (3,))
 
     @classmethod
     def from_quaternion(cls, translation: ArrayLike, quaternion: ArrayLike) -> Transform:

@@ -131,3 +131,9 @@ def test_skew_is_the_cross_product(u, v):
 def test_a_quaternion_that_is_none_is_refused_by_name_and_value(q):
     with pytest.raises(ValueError, match='quaternion = '):
         geo.normalize_quaternion(q)
+
+
+@pytest.mark.parametrize('part', geo.Transform._fields)
+def test_the_identity_of_all_transforms_cannot_be_changed(part):
+    with pytest.raises(ValueError, match='read-only'):
+        getattr(geo.Transform(), part)[0] = 1.0

@@ -223,9 +223,8 @@ class Hypotheses:
                         covariance: Array, alike: Array | None) -> UpdateOutcome:
         """Update the primary track with a measurement, if both can be of one body."""
         last, reach = self.primary.newest, self._reach(time)
-        if last is not None and time > last.stamp and (
-                math.dist(measured.translation, last.position) > reach) and (
-                self.primary.place(time) is None):
+        if last is not None and time - last.stamp > self.params.max_gap and (
+                math.dist(measured.translation, last.position) > reach):
             return UpdateOutcome.OUTLIER
         surprised = last is None or time - last.stamp <= GAP
         outcome = self.primary.update(time, measured, reference, covariance,

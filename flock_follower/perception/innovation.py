@@ -33,6 +33,7 @@ from flock_follower.geometry import Array, skew
 
 ALIKE_TIME = 0.25  # s, time constant of the errors
 FORGET_AFTER = 6.0  # time constants without such a measurement until the errors are forgotten
+_IDENTITY = np.eye(6)  # np.eye takes several times as long as a copy
 
 
 class AlikeErrors:
@@ -103,7 +104,7 @@ def to_body(lever: Array) -> Array:
     ``lever`` (3,) is the vector from the body's origin to the point, in odom: p = p_point - R l,
     so dp = dp_point + [R l]x dr.
     """
-    matrix = np.eye(6)
+    matrix = _IDENTITY.copy()
     matrix[:3, 3:] = skew(lever)
     return matrix
 

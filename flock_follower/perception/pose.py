@@ -250,7 +250,7 @@ def _starts_of(camera: CameraModel, sought: Target, index: int,
     """Return the edges of a detected marker alone, and both poses of its neighbor."""
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
-    return sought.model.only(_alone(sought.model, index)), [
+    return sought.model.only(tuple(k == index for k in range(len(sought.model.codes)))), [
         pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
 
 
@@ -318,18 +318,14 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
         return _Shown(None) if found is None else _Shown(
             None, _sharp(found), found.blur < PLAIN_BLUR)
     if shown is None:  # one that is covered spoils them all
-        alone = [fit(image, camera, seen.only(_alone(seen, k)), start, spacing)
-                 for k in range(len(seen.codes))]
+        count = len(seen.codes)
+        alone = [fit(image, camera, seen.only(tuple(k == one for k in range(count))), start,
+                     spacing) for one in range(count)]
         shown = tuple(f is not None and _find_shown(image, f, True)[0] for f in alone)
     if not any(shown):
         return _Shown(None)
     found = fit(image, camera, seen.only(shown), start, spacing)
     return _Shown(found if found is not None and all(_find_shown(image, found, True)) else None)
-
-
-def _alone(model: EdgeModel, index: int) -> tuple[bool, ...]:
-    """Return one marker alone, as ``EdgeModel.only`` takes it."""
-    return tuple(k == index for k in range(len(model.codes)))
 
 
 def _plain(found: EdgeFit) -> bool:

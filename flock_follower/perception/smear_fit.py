@@ -365,7 +365,7 @@ def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int)
     if lens >= N_FOCUSED:
         return lens
     blur = _LENS_BLUR * pose.apply(model.middle)[2] / (camera.matrix[0, 0] * model.cell)
-    return int(np.abs(LENS_BLURS[:N_FOCUSED] - blur).argmin())
+    return min(range(N_FOCUSED), key=lambda each: abs(float(LENS_BLURS[each]) - blur))
 
 
 def _linearize(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
@@ -429,9 +429,9 @@ def _by_pose(basis: Array, places: Array, center: Array, right: Array, down: Arr
     middle = basis.copy()
     middle[:, 2] -= center
     arm_x, arm_y, arm_z = middle.dot(places)
-    design[3] = arm_y * z - arm_z * y
-    design[4] = arm_z * x - arm_x * z
-    design[5] = arm_x * y - arm_y * x
+    np.subtract(arm_y * z, arm_z * y, out=design[3])
+    np.subtract(arm_z * x, arm_x * z, out=design[4])
+    np.subtract(arm_x * y, arm_y * x, out=design[5])
 
 
 def _check_fit(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | None:

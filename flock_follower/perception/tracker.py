@@ -366,6 +366,9 @@ class Tracker:
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbors that are not measured yet."""
         camera, dictionary = look.camera, self.config.dictionary
+        if look.measured.keys() >= {*look.near, *look.anywhere}:
+            camera.portion, camera.searched_near = 0, False
+            return
         camera.portion = camera.portion if look.missing else 0
         due = self._schedule.search_due(camera, look.stamp)
         for thorough in (False, True):
