@@ -146,7 +146,7 @@ def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | N
     places += pose.translation
     if not count or np.count_nonzero(places[:, 2] > _LEAST_DEPTH) < len(places):
         return None
-    xy = places[:, :2] / places[:, 2:]
+    xy = np.divide(places[:, :2].T, places[:, 2], out=np.empty((2, len(places)))).T
     pixels = camera.distort(xy)
     if not math.isfinite(cv2.norm(pixels)):
         return None
