@@ -205,6 +205,8 @@ def profiles_across(image: GrayImage, pixels: Array, along: Array, steps: Any,
     right, bottom = min(int(high_x) + 1, width), min(int(high_y) + 1, height)
     if right - left < 2 or bottom - top < 2:
         return None
+    stride = right - left
+    part = image[top:bottom, left:right].astype(np.float32).ravel()
     count = len(pixels)
     starts = np.empty((2, count, 2), dtype=np.float32)
     starts[0, :, 0], starts[1, :, 0] = places[0] - left, places[1] - top
@@ -212,20 +214,17 @@ def profiles_across(image: GrayImage, pixels: Array, along: Array, steps: Any,
     at = starts.reshape(-1, 2).dot(steps).reshape(2, count, -1)
     x, y = at
     if low_x < 0.0 or low_y < 0.0 or high_x > width or high_y > height:
-        np.clip(x, 0.0, np.float32(right - left - 1.001), out=x)
+        np.clip(x, 0.0, np.float32(stride - 1.001), out=x)
         np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
     whole = np.floor(at)
     at -= whole
     column, index = whole.astype(np.intp)  # other integers would be turned into these
-    index *= width
+    index *= stride
     index += column
-    # Of each sample, the pixels to the left and to the right, above and below.
-    pixels_around = np.empty((4, *x.shape), dtype=np.float32)
-    first = image.ravel()[top * width + left:]
-    for pixel, offset in zip(pixels_around, (0, width, 1, width + 1)):
-        pixel[:] = first[offset:].take(index)
-    at_left, at_right = pixels_around[:2], pixels_around[2:]
-    above, below = at_left + x * (at_right - at_left)
+    next_row = part[stride:]
+    above, below = part.take(index), next_row.take(index)
+    above += x * (part[1:].take(index) - above)
+    below += x * (next_row[1:].take(index) - below)
     below -= above
     below *= y
     below += above
