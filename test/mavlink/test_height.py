@@ -297,7 +297,7 @@ def test_suspected_source_is_followed_by_the_fast_observer(side):
 
 
 @pytest.mark.parametrize(('jump', 'counts'), [(12.5, False), (13.5, True)])
-def test_for_three_seconds_a_suspected_source_proves_no_small_jump(jump, counts):
+def test_while_a_source_is_suspected_no_small_jump_counts(jump, counts):
     heights = HeightEstimator()
     for k in range(round((jump + 0.3) / PERIOD)):
         now = k * PERIOD
