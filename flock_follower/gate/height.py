@@ -67,6 +67,8 @@ PROOF_TIME: Final[float] = 10.0
 SETTLING: Final[float] = 3.0
 #: m/s: more than this is not corrected beyond the steps of a source: the sensor may be wrong.
 MAX_CORRECTION: Final[float] = 2.0
+#: From this age of a height on, s, the rate of the other source is watched without it.
+SILENCE: Final[float] = 0.08
 #: A height older than this, s, is not known any more.
 HEIGHT_TIMEOUT: Final[float] = 1.0
 #: The sensor has jumped if its newest samples differ on average by more than this from the height
@@ -339,7 +341,7 @@ class HeightEstimator:
 
     def is_silent(self, now: float) -> bool:
         """Return whether the sensor is silent, but was received before."""
-        return STEP_TIME < now - self._time < math.inf
+        return SILENCE < now - self._time < math.inf
 
     @property
     def has_reference(self) -> bool:
