@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 import math
 
-from flown import Follower, own, seen, STILL
+from flown import commanded, Follower, own, seen, step, STILL
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -39,7 +39,7 @@ from flock_follower.planner.guard import (
 )
 from flock_follower.planner.inputs import Neighbor, Prediction
 from flock_follower.planner.limits import LimitedCommand
-from flock_follower.planner.memory import Loss
+from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.retreat import overflight, retreat, RETREAT_TIME
 from flock_follower.planner.scene import across_path
@@ -162,6 +162,59 @@ def test_it_flies_no_farther_along_line_of_sight_than_was_free() -> None:
     *_, (position, _) = pushed(lambda p, v: sort_bounds(
         [], fences(LOST._replace(origin=p), p, v, PARAMS)), velocity=(0.5, 0.0, 0.0))
     assert position[0] == pytest.approx(2.0 - PARAMS.guarding.m, abs=0.05)
+
+
+def test_at_the_place_of_the_loss_only_the_line_of_sight_is_fenced() -> None:
+    onward, = fences(LOST, LOST.origin, np.zeros(3), PARAMS)
+    assert onward.normal == pytest.approx(-AHEAD) and math.isfinite(onward.least)
+    aside = np.array([0.0, -0.5, 3.0])  # the height does not count
+    outward, same = fences(LOST, aside, np.zeros(3), PARAMS)
+    assert outward.normal == pytest.approx([0.0, 1.0, 0.0]) and same == onward
+    assert fences(None, aside, np.zeros(3), PARAMS) == []
+
+
+def test_at_the_end_of_the_retreat_it_steps_aside_by_twice_as_much() -> None:
+    away = Bound([-1.0, 0.0, 0.0], 2.0, 'separation', 2.0, False)
+    far = retreat(COMING, PARAMS)
+    for back, aside in ((0.0, 0.0), (0.5 * far, 1.0), (far, 2.0), (1.5 * far, 2.0)):
+        normal = limit_to_retreat(away, COMING, -back * AHEAD, np.zeros(3), PARAMS).normal
+        assert normal == pytest.approx(np.array([-1.0, aside, 0.0]) / math.hypot(1.0, aside))
+    for changes in ({'approach': 0.05}, {'side': np.array([1.0, 0.0, 0.0])}):
+        assert limit_to_retreat(away, COMING._replace(**changes), -far * AHEAD, np.zeros(3),
+                                PARAMS).normal == away.normal
+    assert limit_to_retreat(away, COMING, -far * AHEAD, np.zeros(3), PARAMS,
+                            False).normal == away.normal
+
+
+HIDDEN = 1.9  # s that it has been out of sight
+
+
+def beside_hidden(place: ArrayLike | None, velocity: ArrayLike = STILL,
+                  received: bool = False) -> Array:
+    """Return the command behind a leader 1.6 m ahead if another one was lost at a place."""
+    params = PlannerParams()
+    memory, _ = step(Memory(), 0.0, True, own(), [seen(0.0, (1.6, 0.0, 2.0))], params)
+    if place is not None:
+        hidden = seen(0.0, np.array([*place, 2.0]) - HIDDEN * np.array(velocity), velocity, 'B',
+                      member=Member('follower'))
+        memory = memory._replace(flock={**memory.flock, 'B': hidden})
+    ahead = seen(HIDDEN, (1.6, 0.0, 2.0), received=received)
+    return commanded(step(memory, HIDDEN, True, own(HIDDEN), [ahead], params)[1])
+
+
+@pytest.mark.parametrize(('place', 'covered'), [
+    ((2.6, 0.0), True), ((2.6, 1.4), True), ((2.6, -1.4), True), ((2.6, 1.7), False),
+    ((1.5, 0.0), False), ((-2.6, 0.0), False), ((1.6, -2.0), False)])
+def test_one_hidden_by_another_may_not_be_anywhere(
+        place: tuple[float, float], covered: bool) -> None:
+    assert np.array_equal(beside_hidden(place), beside_hidden(None)) == covered
+    if covered:
+        assert not np.array_equal(beside_hidden(place, received=True),
+                                  beside_hidden(None, received=True))
+
+
+def test_one_that_comes_is_kept_clear_of_where_it_is_covered() -> None:
+    assert beside_hidden((1.65, 0.0), (-0.5, 0.0, 0.0))[0] < beside_hidden(None)[0] - 0.1
 
 
 def near(position: list[float], velocity: list[float], radius: float = 0.0) -> Neighbor:
