@@ -30,7 +30,7 @@ import pytest
 from flock_follower.geometry import Array
 from flock_follower.planner.bound_keeping import Bound
 from flock_follower.planner.bound_keeping import keep_bounds as guard
-from flock_follower.planner.bounds import in_sight
+from flock_follower.planner.bounds import in_sight, stop
 from flock_follower.planner.guard import (
     climb_rates,
     fences,
@@ -164,7 +164,7 @@ def test_it_flies_no_farther_along_line_of_sight_than_was_free() -> None:
     assert position[0] == pytest.approx(2.0 - PARAMS.guarding.m, abs=0.05)
 
 
-def test_at_the_place_of_the_loss_only_the_line_of_sight_is_fenced() -> None:
+def test_where_it_was_lost_only_the_line_of_sight_is_fenced() -> None:
     onward, = fences(LOST, LOST.origin, np.zeros(3), PARAMS)
     assert onward.normal == pytest.approx(-AHEAD) and math.isfinite(onward.least)
     aside = np.array([0.0, -0.5, 3.0])  # the height does not count
@@ -173,7 +173,7 @@ def test_at_the_place_of_the_loss_only_the_line_of_sight_is_fenced() -> None:
     assert fences(None, aside, np.zeros(3), PARAMS) == []
 
 
-def test_at_the_end_of_the_retreat_it_steps_aside_by_twice_as_much() -> None:
+def test_at_the_end_of_the_retreat_it_steps_aside_twice_as_much() -> None:
     away = Bound([-1.0, 0.0, 0.0], 2.0, 'separation', 2.0, False)
     far = retreat(COMING, PARAMS)
     for back, aside in ((0.0, 0.0), (0.5 * far, 1.0), (far, 2.0), (1.5 * far, 2.0)):
@@ -184,6 +184,15 @@ def test_at_the_end_of_the_retreat_it_steps_aside_by_twice_as_much() -> None:
                                 PARAMS).normal == away.normal
     assert limit_to_retreat(away, COMING, -far * AHEAD, np.zeros(3), PARAMS,
                             False).normal == away.normal
+
+
+@pytest.mark.parametrize('place', [(0.0, 0.0), (-1.0, 1.2), (1.0, -1.2), (0.5, 1.2)])
+def test_the_retreat_ends_on_a_circle(place: tuple[float, float]) -> None:
+    far, (x, y) = retreat(LOST, PARAMS), place
+    away = Bound([-1.0, 0.0, 0.0], 1e9, 'separation', 2.0, False)
+    left = x + math.sqrt(far ** 2 - y ** 2)
+    assert limit_to_retreat(away, LOST, np.array([x, y, 1.0]), [0.3, 0.1, 0.0], PARAMS).least == (
+        pytest.approx(-stop([-1.0, 0.0, 0.0], left, [0.3, 0.1, 0.0], PARAMS).least))
 
 
 HIDDEN = 1.9  # s that it has been out of sight
@@ -256,12 +265,19 @@ def test_the_height_between_is_that_of_hulls() -> None:
     assert climb_rates([still], OWN, params)[1] < -0.2
     aside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0], 0.3)
     assert climb_rates([aside], OWN, params)[1] < 0.4
+    beside = near([1.2, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)
+    assert climb_rates([beside], OWN, params)[1] == 0.0
+    # Another one that is far away changes nothing.
+    assert climb_rates([near([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]), aside, beside], OWN, params) == (
+        climb_rates([beside, aside], OWN, params))
 
 
 def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     params = PlannerParams(v_max=0.5)
     assert climb_rates([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (-0.3, 0.3))
+    assert climb_rates([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, PlannerParams(
+        v_max=0.8))[1] == pytest.approx(math.sqrt(0.8 ** 2 - 0.4 ** 2))
     # Backing away from one that hovers too near takes its part, too.
     backing = own(0.0, np.zeros(3), (-0.4, 0.0, 0.0))
     assert climb_rates([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing,
@@ -271,3 +287,18 @@ def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
         (0.0, 0.0))
     assert climb_rates([near([1.8, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
         -math.inf, math.inf)
+
+
+@pytest.mark.parametrize('angle', [0.5, 1.5708, 2.5, -1.0])
+@pytest.mark.parametrize(('position', 'velocity', 'backing'), [
+    ((1.5, 0.0, 0.3), (-0.4, 0.0, 0.0), 0.0), ((1.05, 0.0, 0.3), (0.0, 0.0, 0.0), -0.4),
+    ((0.95, 0.0, 0.3), (-0.2, 0.3, 0.0), -0.1), ((0.5, 0.0, 0.8), (-0.3, 0.2, -0.2), 0.0)])
+def test_the_direction_of_a_neighbor_does_not_change_the_climb(
+        angle: float, position: ArrayLike, velocity: ArrayLike, backing: float) -> None:
+    params, cos, sin = PlannerParams(v_max=0.5), math.cos(angle), math.sin(angle)
+    turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    found = [climb_rates([near((axes @ np.array(position)).tolist(),
+                               (axes @ np.array(velocity)).tolist())],
+                         own(0.0, np.zeros(3), backing * axes @ AHEAD), params)
+             for axes in (np.eye(3), turned)]
+    assert found[1] == pytest.approx(found[0]) and found[0] != (-math.inf, math.inf)
