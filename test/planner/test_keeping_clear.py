@@ -267,6 +267,7 @@ def test_the_height_between_is_that_of_hulls() -> None:
     assert climb_rates([aside], OWN, params)[1] < 0.4
     beside = near([1.2, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)
     assert climb_rates([beside], OWN, params)[1] == 0.0
+    assert climb_rates([near([1.0, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)], OWN, params)[0] == -math.inf
     # Another one that is far away changes nothing.
     assert climb_rates([near([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]), aside, beside], OWN, params) == (
         climb_rates([beside, aside], OWN, params))
@@ -282,11 +283,27 @@ def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     backing = own(0.0, np.zeros(3), (-0.4, 0.0, 0.0))
     assert climb_rates([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing,
                        params) == pytest.approx((-0.3, 0.3))
+    faster = own(0.0, np.zeros(3), (-0.45, 0.0, 0.0))
+    assert climb_rates([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], faster, params)[
+        1] == pytest.approx(math.sqrt(0.5 ** 2 - 0.45 ** 2))
+    assert climb_rates([near([1.7, 0.0, 0.3], [0.0, 0.0, 0.0])], faster, params)[1] == math.inf
     # Nearer than it should be, it returns by 0.4 m/s more, and does not climb meanwhile.
     assert climb_rates([near([0.9, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (0.0, 0.0))
     assert climb_rates([near([1.8, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
         -math.inf, math.inf)
+
+
+def test_the_radii_of_both_hulls_keep_it_farther_away() -> None:
+    found = []
+    for radius, its in ((0.0, 0.0), (0.5, 0.0), (0.2, 0.3), (0.0, 0.5)):
+        params = PlannerParams(radius=radius)
+        leader = seen(0.0, (1.8, 0.0, 2.0), (-0.2, 0.0, 0.0), member=Member(radius=its))
+        memory, _ = step(Memory(), 0.0, True, own(), [], params)
+        memory = memory._replace(neighbors={'leader': leader})
+        found.append(commanded(step(memory, 0.1, True, own(0.1), [], params)[1]))
+    assert found[1] == pytest.approx(found[2]) and found[2] == pytest.approx(found[3])
+    assert found[1][0] < found[0][0] - 0.2
 
 
 @pytest.mark.parametrize('angle', [0.5, 1.5708, 2.5, -1.0])
