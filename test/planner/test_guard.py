@@ -27,7 +27,7 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.bound_keeping import Bound, COHESION, SEPARATION
+from flock_follower.planner.bound_keeping import Bound, COHESION, FENCE, SEPARATION, SIGHT
 from flock_follower.planner.bound_keeping import keep_bounds as guard
 from flock_follower.planner.bounds import radial_bounds
 from flock_follower.planner.guard import sort_bounds
@@ -143,6 +143,17 @@ def test_one_in_sight_comes_before_nearer_assumed_one() -> None:
     around = [*pair(0.1, x, 1.5, seen=False), *pair(1.1, -x, 1.0, 9.0)]
     command = guard(np.zeros(3), np.zeros(3), sort_bounds(around), A_MAX, V_MAX, T).acceleration
     assert command[0] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_bounds_come_in_the_order_of_their_importance() -> None:
+    x = np.array([1.0, 0.0, 0.0])
+    near, far = pair(1.0, x, 0.0, 0.0), pair(2.0, x, 0.0, 0.0)
+    hidden = [Bound(x, 0.0, SEPARATION, distance, False) for distance in (0.5, 3.0)]
+    fence, sight = Bound(x, 0.0, FENCE), Bound(x, 0.0, SIGHT)
+    found = sort_bounds([far[1], hidden[1], far[0], near[1], hidden[0], near[0]], [fence], [sight])
+    assert [(each.reason, each.distance) for each in found] == [
+        (SEPARATION, 1.0), (SEPARATION, 2.0), (FENCE, 0.0), (SEPARATION, 0.5), (SEPARATION, 3.0),
+        (SIGHT, 0.0), (COHESION, 2.0), (COHESION, 1.0)]
 
 
 def test_cohesion_against_separation_does_not_push_across() -> None:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 import math
 
-from flown import Follower, own, seen, STILL
+from flown import commanded, Follower, own, seen, step, STILL
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -30,7 +30,7 @@ import pytest
 from flock_follower.geometry import Array
 from flock_follower.planner.bound_keeping import Bound
 from flock_follower.planner.bound_keeping import keep_bounds as guard
-from flock_follower.planner.bounds import in_sight
+from flock_follower.planner.bounds import in_sight, stop
 from flock_follower.planner.guard import (
     climb_rates,
     fences,
@@ -39,7 +39,7 @@ from flock_follower.planner.guard import (
 )
 from flock_follower.planner.inputs import Neighbor, Prediction
 from flock_follower.planner.limits import LimitedCommand
-from flock_follower.planner.memory import Loss
+from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.retreat import overflight, retreat, RETREAT_TIME
 from flock_follower.planner.scene import across_path
@@ -164,6 +164,68 @@ def test_it_flies_no_farther_along_line_of_sight_than_was_free() -> None:
     assert position[0] == pytest.approx(2.0 - PARAMS.guarding.m, abs=0.05)
 
 
+def test_where_it_was_lost_only_the_line_of_sight_is_fenced() -> None:
+    onward, = fences(LOST, LOST.origin, np.zeros(3), PARAMS)
+    assert onward.normal == pytest.approx(-AHEAD) and math.isfinite(onward.least)
+    aside = np.array([0.0, -0.5, 3.0])  # the height does not count
+    outward, same = fences(LOST, aside, np.zeros(3), PARAMS)
+    assert outward.normal == pytest.approx([0.0, 1.0, 0.0]) and same == onward
+    assert fences(None, aside, np.zeros(3), PARAMS) == []
+
+
+def test_at_the_end_of_the_retreat_it_steps_aside_twice_as_much() -> None:
+    away = Bound([-1.0, 0.0, 0.0], 2.0, 'separation', 2.0, False)
+    far = retreat(COMING, PARAMS)
+    for back, aside in ((0.0, 0.0), (0.5 * far, 1.0), (far, 2.0), (1.5 * far, 2.0)):
+        normal = limit_to_retreat(away, COMING, -back * AHEAD, np.zeros(3), PARAMS).normal
+        assert normal == pytest.approx(np.array([-1.0, aside, 0.0]) / math.hypot(1.0, aside))
+    for changes in ({'approach': 0.05}, {'side': np.array([1.0, 0.0, 0.0])}):
+        assert limit_to_retreat(away, COMING._replace(**changes), -far * AHEAD, np.zeros(3),
+                                PARAMS).normal == away.normal
+    assert limit_to_retreat(away, COMING, -far * AHEAD, np.zeros(3), PARAMS,
+                            False).normal == away.normal
+
+
+@pytest.mark.parametrize('place', [(0.0, 0.0), (-1.0, 1.2), (1.0, -1.2), (0.5, 1.2)])
+def test_the_retreat_ends_on_a_circle(place: tuple[float, float]) -> None:
+    far, (x, y) = retreat(LOST, PARAMS), place
+    away = Bound([-1.0, 0.0, 0.0], 1e9, 'separation', 2.0, False)
+    left = x + math.sqrt(far ** 2 - y ** 2)
+    assert limit_to_retreat(away, LOST, np.array([x, y, 1.0]), [0.3, 0.1, 0.0], PARAMS).least == (
+        pytest.approx(-stop([-1.0, 0.0, 0.0], left, [0.3, 0.1, 0.0], PARAMS).least))
+
+
+HIDDEN = 1.9  # s that it has been out of sight
+
+
+def beside_hidden(place: ArrayLike | None, velocity: ArrayLike = STILL,
+                  received: bool = False) -> Array:
+    """Return the command behind a leader 1.6 m ahead if another one was lost at a place."""
+    params = PlannerParams()
+    memory, _ = step(Memory(), 0.0, True, own(), [seen(0.0, (1.6, 0.0, 2.0))], params)
+    if place is not None:
+        hidden = seen(0.0, np.array([*place, 2.0]) - HIDDEN * np.array(velocity), velocity, 'B',
+                      member=Member('follower'))
+        memory = memory._replace(flock={**memory.flock, 'B': hidden})
+    ahead = seen(HIDDEN, (1.6, 0.0, 2.0), received=received)
+    return commanded(step(memory, HIDDEN, True, own(HIDDEN), [ahead], params)[1])
+
+
+@pytest.mark.parametrize(('place', 'covered'), [
+    ((2.6, 0.0), True), ((2.6, 1.4), True), ((2.6, -1.4), True), ((2.6, 1.7), False),
+    ((1.5, 0.0), False), ((-2.6, 0.0), False), ((1.6, -2.0), False)])
+def test_one_hidden_by_another_may_not_be_anywhere(
+        place: tuple[float, float], covered: bool) -> None:
+    assert np.array_equal(beside_hidden(place), beside_hidden(None)) == covered
+    if covered:
+        assert not np.array_equal(beside_hidden(place, received=True),
+                                  beside_hidden(None, received=True))
+
+
+def test_one_that_comes_is_kept_clear_of_where_it_is_covered() -> None:
+    assert beside_hidden((1.65, 0.0), (-0.5, 0.0, 0.0))[0] < beside_hidden(None)[0] - 0.1
+
+
 def near(position: list[float], velocity: list[float], radius: float = 0.0) -> Neighbor:
     return seen(0.0, position, velocity, member=Member(radius=radius))
 
@@ -203,18 +265,57 @@ def test_the_height_between_is_that_of_hulls() -> None:
     assert climb_rates([still], OWN, params)[1] < -0.2
     aside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0], 0.3)
     assert climb_rates([aside], OWN, params)[1] < 0.4
+    beside = near([1.2, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)
+    assert climb_rates([beside], OWN, params)[1] == 0.0
+    assert climb_rates([near([1.0, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)], OWN, params)[0] == -math.inf
+    # Another one that is far away changes nothing.
+    assert climb_rates([near([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]), aside, beside], OWN, params) == (
+        climb_rates([beside, aside], OWN, params))
 
 
 def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     params = PlannerParams(v_max=0.5)
     assert climb_rates([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (-0.3, 0.3))
+    assert climb_rates([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, PlannerParams(
+        v_max=0.8))[1] == pytest.approx(math.sqrt(0.8 ** 2 - 0.4 ** 2))
     # Backing away from one that hovers too near takes its part, too.
     backing = own(0.0, np.zeros(3), (-0.4, 0.0, 0.0))
     assert climb_rates([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing,
                        params) == pytest.approx((-0.3, 0.3))
+    faster = own(0.0, np.zeros(3), (-0.45, 0.0, 0.0))
+    assert climb_rates([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], faster, params)[
+        1] == pytest.approx(math.sqrt(0.5 ** 2 - 0.45 ** 2))
+    assert climb_rates([near([1.7, 0.0, 0.3], [0.0, 0.0, 0.0])], faster, params)[1] == math.inf
     # Nearer than it should be, it returns by 0.4 m/s more, and does not climb meanwhile.
     assert climb_rates([near([0.9, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (0.0, 0.0))
     assert climb_rates([near([1.8, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
         -math.inf, math.inf)
+
+
+def test_the_radii_of_both_hulls_keep_it_farther_away() -> None:
+    found = []
+    for radius, its in ((0.0, 0.0), (0.5, 0.0), (0.2, 0.3), (0.0, 0.5)):
+        params = PlannerParams(radius=radius)
+        leader = seen(0.0, (1.8, 0.0, 2.0), (-0.2, 0.0, 0.0), member=Member(radius=its))
+        memory, _ = step(Memory(), 0.0, True, own(), [], params)
+        memory = memory._replace(neighbors={'leader': leader})
+        found.append(commanded(step(memory, 0.1, True, own(0.1), [], params)[1]))
+    assert found[1] == pytest.approx(found[2]) and found[2] == pytest.approx(found[3])
+    assert found[1][0] < found[0][0] - 0.2
+
+
+@pytest.mark.parametrize('angle', [0.5, 1.5708, 2.5, -1.0])
+@pytest.mark.parametrize(('position', 'velocity', 'backing'), [
+    ((1.5, 0.0, 0.3), (-0.4, 0.0, 0.0), 0.0), ((1.05, 0.0, 0.3), (0.0, 0.0, 0.0), -0.4),
+    ((0.95, 0.0, 0.3), (-0.2, 0.3, 0.0), -0.1), ((0.5, 0.0, 0.8), (-0.3, 0.2, -0.2), 0.0)])
+def test_the_direction_of_a_neighbor_does_not_change_the_climb(
+        angle: float, position: ArrayLike, velocity: ArrayLike, backing: float) -> None:
+    params, cos, sin = PlannerParams(v_max=0.5), math.cos(angle), math.sin(angle)
+    turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    found = [climb_rates([near((axes @ np.array(position)).tolist(),
+                               (axes @ np.array(velocity)).tolist())],
+                         own(0.0, np.zeros(3), backing * axes @ AHEAD), params)
+             for axes in (np.eye(3), turned)]
+    assert found[1] == pytest.approx(found[0]) and found[0] != (-math.inf, math.inf)

@@ -367,6 +367,8 @@ def test_braking_and_separation_keep_the_limits_of_the_start() -> None:
     near = settled(leader(0.0, (1.0, 0.0, 2.0)), (0.1, 0.0, 0.0), LOWERED)
     assert 'separation' in near.limits
     assert commanded(near)[0] < -0.7
+    coming = settled(leader(0.0, (0.9, 0.0, 2.0), (-0.5, 0.0, 0.0)), (0.3, 0.0, 0.0), LOWERED)
+    assert -2.5 < commanded(coming)[0] < -1.6  # a_max, lowered, would leave -1.5
     fast = (0.4, 0.0, 0.0)
     for params in (LOWERED, PARAMS):
         _, decision = step(Memory(), 0.0, True, own(velocity=fast), [], params)

@@ -102,6 +102,25 @@ def test_best_point_equals_search_of_all_candidates(far: bool) -> None:
     assert 0.1 * CASES < none < 0.5 * CASES
 
 
+def test_the_solution_moves_with_discs_bounds_and_goal() -> None:
+    for case in range(CASES):
+        rng = np.random.default_rng([3, case])
+        discs = two_discs(rng, DISCS[case % len(DISCS)])
+        sides, goal, by = bounds(rng, discs, 'with room', 5), 3.0 * normal(rng), normal(rng)
+        moved = discs._replace(center=discs.center + by, other=discs.other + by)
+        assert moved.best(goal + by) == pytest.approx(discs.best(goal) + by, abs=1e-6), case
+        point = nearest_in_order(
+            goal + by, [(n, least + product(n, by)) for n, least in sides], moved)
+        assert point == pytest.approx(nearest_in_order(goal, sides, discs) + by, abs=1e-6), case
+
+
+@pytest.mark.parametrize('far', [False, True])
+def test_best_point_of_two_discs_of_radius_and_distance_1(far: bool) -> None:
+    for side in (1j, -1j):
+        assert Discs(0j, 1.0, 1.0 + 0j, 1.0).best(3.0 * side + 0.5, far=far) == pytest.approx(
+            0.5 + math.sqrt(0.75) * side)
+
+
 def test_bounds_that_conflict_by_rounding_are_all_met() -> None:
     """Whichever way a comparison falls out, and whatever bound beyond reach comes after them."""
     for case in range(500):

@@ -132,13 +132,14 @@ def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
     assert not any('looks for' in warning for d in decisions for warning in d.warnings)
 
 
-def beside_silent(place: ArrayLike, velocity: ArrayLike = STILL, variance: float = 0.0) -> Array:
+def beside_silent(place: ArrayLike, velocity: ArrayLike = STILL, variance: float = 0.0,
+                  ahead: ArrayLike = (2.0, 0.0, 2.0)) -> Array:
     """Return the command beside a follower that was received for the last time 1.2 s ago."""
-    memory, _ = decide(Memory(), 0.0, seen(0.0))
+    memory, _ = decide(Memory(), 0.0, seen(0.0, ahead))
     silent = seen(0.0, place, velocity, 'behind', position_covariance=variance * np.eye(3),
                   received=True, member=Member('follower'))
     memory = memory._replace(flock={**memory.flock, 'behind': silent})
-    return commanded(decide(memory, 1.2, seen(1.2))[1])
+    return commanded(decide(memory, 1.2, seen(1.2, ahead))[1])
 
 
 def test_silent_follower_hovers_where_its_stop_ends() -> None:
@@ -150,6 +151,17 @@ def test_silent_follower_hovers_where_its_stop_ends() -> None:
     # Where it was is known up to two standard deviations.
     assert beside_silent((-1.4, 0.0, 2.0), STILL, 0.01) == pytest.approx(
         beside_silent((-1.2, 0.0, 2.0)))
+
+
+@pytest.mark.parametrize('angle', [0.7, 1.6, 2.5, -0.4])
+def test_silent_follower_is_passed_alike_in_every_direction(angle: float) -> None:
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    places = np.array([-1.2, 0.1, 2.0]), np.array([2.0, 0.0, 2.0])
+    first = beside_silent(places[0], ahead=places[1])
+    there, ahead = (turned @ place for place in places)
+    assert beside_silent(there, ahead=ahead) == pytest.approx(turned @ first, abs=1e-6)
+    assert first[1] > 0.1  # beside it
 
 
 def test_pushed_back_it_passes_beside_silent_follower() -> None:
