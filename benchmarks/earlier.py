@@ -84,10 +84,13 @@ class Earlier:
     """
 
     def __init__(self, package: str, dictionary: str, T_body_camera: Transform) -> None:
+        reader = 'messages.state_reader'
+        if not (COPIES / package / 'messages' / 'state_reader.py').exists():
+            reader = 'messages'  # until November 28, 2026
         markers, geometry, tracker, pending, self._messages = (
             import_module(f'{package}.{module}') for module in (
                 'perception.markers', 'geometry', 'perception.tracker',
-                'perception.pending_images', 'messages'))
+                'perception.pending_images', reader))
         config = replace(markers.load(resource('config/neighbors.yaml')), dictionary=dictionary)
         self._tracker = tracker.Tracker(config, geometry.Transform(
             T_body_camera.rotation, T_body_camera.translation))
