@@ -156,8 +156,8 @@ class Telemetry:
             self._attitude(message, now)
         elif kind == 'SCALED_PRESSURE':
             altitude, known = pressure_altitude(message.press_abs), self.sensor_altitude
-            # The same number again is no measurement: a sensor that is slower, or stuck.
-            if known is None or altitude != known.altitude:
+            # In flight, the same number again is no measurement: a sensor is slower, or stuck.
+            if known is None or altitude != known.altitude or self.is_flying(now) is False:
                 self.sensor_altitude = SensorAltitude(now, altitude, kind)
         elif kind == 'DISTANCE_SENSOR':
             self._distance(message, now)

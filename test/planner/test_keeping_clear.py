@@ -199,15 +199,15 @@ HIDDEN = 1.9  # s that it has been out of sight
 
 
 def beside_hidden(place: ArrayLike | None, velocity: ArrayLike = STILL,
-                  received: bool = False) -> Array:
-    """Return the command behind a leader 1.6 m ahead if another one was lost at a place."""
+                  received: bool = False, distance: float = 1.6) -> Array:
+    """Return the command behind a leader ahead, m, if another one was lost at a place."""
     params = PlannerParams()
-    memory, _ = step(Memory(), 0.0, True, own(), [seen(0.0, (1.6, 0.0, 2.0))], params)
+    memory, _ = step(Memory(), 0.0, True, own(), [seen(0.0, (distance, 0.0, 2.0))], params)
     if place is not None:
         hidden = seen(0.0, np.array([*place, 2.0]) - HIDDEN * np.array(velocity), velocity, 'B',
                       member=Member('follower'))
         memory = memory._replace(flock={**memory.flock, 'B': hidden})
-    ahead = seen(HIDDEN, (1.6, 0.0, 2.0), received=received)
+    ahead = seen(HIDDEN, (distance, 0.0, 2.0), received=received)
     return commanded(step(memory, HIDDEN, True, own(HIDDEN), [ahead], params)[1])
 
 
@@ -220,6 +220,11 @@ def test_one_hidden_by_another_may_not_be_anywhere(
     if covered:
         assert not np.array_equal(beside_hidden(place, received=True),
                                   beside_hidden(None, received=True))
+
+
+def test_one_before_another_is_not_hidden_by_it() -> None:
+    unsure, behind = (beside_hidden((x, 0.0), distance=2.4) for x in (2.3, 2.5))
+    assert unsure[0] < -0.5 < behind[0]
 
 
 def test_one_that_comes_is_kept_clear_of_where_it_is_covered() -> None:

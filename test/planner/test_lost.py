@@ -32,7 +32,7 @@ from flock_follower.messages.commands import ODOMETRY_GAP
 from flock_follower.planner.inputs import FRESH, Neighbor, predict
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.retreat import (
     DRIFT_SPEED,
     fallback_retreat,
@@ -99,6 +99,16 @@ def test_where_it_shall_not_retreat_it_stays(retreat_max: float, looked: float |
     for _ in range(100):
         follower.tick(looked=looked)
     assert abs(follower.position[0]) < 0.35  # what the leader had pushed it back before
+
+
+def test_without_retreat_it_still_avoids_another_one_in_sight() -> None:
+    follower = lost(params=PlannerParams(retreat_max=0.0, vehicles={'other': Member('avoid')}))
+    for _ in range(60):
+        follower.tick()
+    behind = follower.position - 0.45 * AHEAD
+    decision = follower.tick(seen(follower.now, behind, (0.3, 0.0, 0.0), 'other'))
+    assert decision.state is not State.TRACK and 'separation' in decision.limits
+    assert commanded(decision)[0] > 1.0
 
 
 def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:

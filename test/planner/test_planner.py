@@ -31,6 +31,7 @@ import pytest
 
 from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array
+from flock_follower.planner.bound_keeping import SPEED_TIME
 from flock_follower.planner.inputs import FUTURE_TOLERANCE, Neighbor
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import next_state, State
@@ -353,6 +354,14 @@ def settled(it: Neighbor, velocity: ArrayLike, params: PlannerParams) -> Decisio
             it._replace(stamp=now)], params)
         memory = memory._replace(own=None)  # where it is is no jump
     return decision
+
+
+def test_v_max_is_approached_within_speed_time() -> None:
+    """Not within one period, in which the noise of the velocity would be a command."""
+    leaving = leader(0.0, (3.2, 0.0, 2.0), (0.5, 0.0, 0.0))
+    for speed in (0.4, 0.46):  # what was commanded before counts for 0.3 s
+        command = commanded(settled(leaving, (speed, 0.0, 0.0), PARAMS))
+        assert command[0] == pytest.approx((PARAMS.v_max - speed) / (SPEED_TIME + 0.3), rel=0.02)
 
 
 def test_lowered_limits_bind_what_is_wanted() -> None:

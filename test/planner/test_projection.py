@@ -114,11 +114,19 @@ def test_the_solution_moves_with_discs_bounds_and_goal() -> None:
         assert point == pytest.approx(nearest_in_order(goal, sides, discs) + by, abs=1e-6), case
 
 
-@pytest.mark.parametrize('far', [False, True])
-def test_best_point_of_two_discs_of_radius_and_distance_1(far: bool) -> None:
+@pytest.mark.parametrize('center', [0j, 5.0 + 5.0j])
+def test_best_point_of_two_discs_of_radius_and_distance_1(center: complex) -> None:
+    discs = Discs(center, 1.0, center + 1.0, 1.0)
     for side in (1j, -1j):
-        assert Discs(0j, 1.0, 1.0 + 0j, 1.0).best(3.0 * side + 0.5, far=far) == pytest.approx(
-            0.5 + math.sqrt(0.75) * side)
+        corner = center + 0.5 + math.sqrt(0.75) * side
+        assert discs.best(center + 0.5 + 3.0 * side) == pytest.approx(corner)
+        assert discs.best(3.0 * side + 0.5, far=True) == pytest.approx(corner)
+
+
+def test_discs_that_miss_each_other_have_the_point_between() -> None:
+    """By more than rounding none should."""
+    discs = Discs(1.0 + 1j, 1.0, 4.0 + 1j, 1.0)
+    assert discs.best(9.0 + 1j) == discs.best(1.0 + 0j, far=True) == 2.0 + 1j
 
 
 def test_bounds_that_conflict_by_rounding_are_all_met() -> None:
