@@ -54,6 +54,9 @@ HEARTBEAT_PERIOD: Final[float] = 1.0
 ESTIMATE_TIMEOUT: Final[float] = 1.0
 #: EXTENDED_SYS_STATE comes at 5 Hz; a landed state older than this, s, is not used.
 LANDED_OLDEST: Final[float] = 3.0
+#: A barometer whose number stays the same for this long on the ground, s, has no noise: a
+#: simulated one, which stays the same in a hover, too.
+NOISELESS_TIME: Final[float] = 0.5
 #: An altitude above sea level older than this, s, is not used.
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: The autopilot has rebooted if stamps of two consecutive attitudes go back by more than this, ms.
@@ -123,6 +126,9 @@ class Telemetry:
         self.newest: dict[str, tuple[float, Any]] = {}
         """The newest message of each type, and its time of arrival, s."""
         self.sensor_altitude: SensorAltitude | None = None
+        self._pressure_altitude = math.nan  # m
+        self._pressure_changed = -math.inf  # s
+        self._noiseless = False
         self.reboots = 0
         self.heartbeat_time = -math.inf
         self.mode_time = -math.inf
@@ -155,10 +161,7 @@ class Telemetry:
         elif kind == 'ATTITUDE_QUATERNION':
             self._attitude(message, now)
         elif kind == 'SCALED_PRESSURE':
-            altitude, known = pressure_altitude(message.press_abs), self.sensor_altitude
-            # In flight, the same number again is no measurement: a sensor is slower, or stuck.
-            if known is None or altitude != known.altitude or self.is_flying(now) is False:
-                self.sensor_altitude = SensorAltitude(now, altitude, kind)
+            self._take_pressure(pressure_altitude(message.press_abs), now)
         elif kind == 'DISTANCE_SENSOR':
             self._distance(message, now)
         elif self.dialect is not None and message.get_msgId() == self.dialect.estimator_status:
@@ -279,6 +282,16 @@ class Telemetry:
         """Return the height above the place of arming by the estimate, m; None if not known."""
         above_sea, home = self.sea_level_altitude(now), self.recent('HOME_POSITION', math.inf, now)
         return None if home is None or above_sea is None else above_sea - home.altitude * 1e-3
+
+    def _take_pressure(self, altitude: float, now: float) -> None:
+        if altitude != self._pressure_altitude:
+            self._pressure_altitude, self._pressure_changed = altitude, now
+        elif self.is_flying(now):
+            if not self._noiseless:  # the same number again is no measurement: it is stuck
+                return
+        elif now - self._pressure_changed > NOISELESS_TIME:
+            self._noiseless = True
+        self.sensor_altitude = SensorAltitude(now, altitude, 'SCALED_PRESSURE')
 
     def _distance(self, message: Any, now: float) -> None:
         """Take a downward rangefinder as long as no barometer is reported."""

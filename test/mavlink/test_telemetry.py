@@ -129,14 +129,17 @@ def test_a_rangefinder_without_a_valid_signal_has_no_altitude(quality, altitude)
     assert altitude == (None if known is None else known.altitude)
 
 
-@pytest.mark.parametrize(('state', 'newest'), [
-    (mavlink.MAV_LANDED_STATE_ON_GROUND, 1.2), (mavlink.MAV_LANDED_STATE_IN_AIR, 1.1)])
-def test_a_pressure_that_repeats_is_a_sample_on_the_ground_only(state, newest):
+@pytest.mark.parametrize(('noise', 'newest'), [(0.01, 3.0), (0.0, 4.0)])
+def test_a_pressure_that_repeats_in_flight_is_stuck_if_it_has_noise(noise, newest):
     telemetry = Telemetry()
-    telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, state), 1.0)
-    for now in (1.1, 1.2):
-        telemetry.update(mavlink.MAVLink_scaled_pressure_message(0, 950.0, 0.0, 2000), now)
-    assert telemetry.sensor_altitude.time == newest
+    for k in range(41):
+        now = 0.1 * k
+        state = (mavlink.MAV_LANDED_STATE_ON_GROUND if now < 2.0 else
+                 mavlink.MAV_LANDED_STATE_IN_AIR)
+        telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, state), now)
+        telemetry.update(mavlink.MAVLink_scaled_pressure_message(
+            0, 950.0 + noise * min(k, 30), 0.0, 2000), now)
+    assert telemetry.sensor_altitude.time == pytest.approx(newest)
 
 
 @pytest.mark.parametrize(('state', 'flying'), [

@@ -199,12 +199,12 @@ HIDDEN = 1.9  # s that it has been out of sight
 
 
 def beside_hidden(place: ArrayLike | None, velocity: ArrayLike = STILL,
-                  received: bool = False, distance: float = 1.6) -> Array:
+                  received: bool = False, distance: float = 1.6, height: float = 2.0) -> Array:
     """Return the command behind a leader ahead, m, if another one was lost at a place."""
     params = PlannerParams()
     memory, _ = step(Memory(), 0.0, True, own(), [seen(0.0, (distance, 0.0, 2.0))], params)
     if place is not None:
-        hidden = seen(0.0, np.array([*place, 2.0]) - HIDDEN * np.array(velocity), velocity, 'B',
+        hidden = seen(0.0, np.array([*place, height]) - HIDDEN * np.array(velocity), velocity, 'B',
                       member=Member('follower'))
         memory = memory._replace(flock={**memory.flock, 'B': hidden})
     ahead = seen(HIDDEN, (distance, 0.0, 2.0), received=received)
@@ -225,6 +225,11 @@ def test_one_hidden_by_another_may_not_be_anywhere(
 def test_one_before_another_is_not_hidden_by_it() -> None:
     unsure, behind = (beside_hidden((x, 0.0), distance=2.4) for x in (2.3, 2.5))
     assert unsure[0] < -0.5 < behind[0]
+
+
+def test_the_height_of_one_out_of_sight_is_not_known() -> None:
+    found = [beside_hidden((1.65, 0.0), (-0.5, 0.0, 0.0), height=height) for height in (2.0, 2.6)]
+    assert found[0] == pytest.approx(found[1]) and found[0][0] > -2.0
 
 
 def test_one_that_comes_is_kept_clear_of_where_it_is_covered() -> None:

@@ -125,8 +125,9 @@ def test_best_point_of_two_discs_of_radius_and_distance_1(center: complex) -> No
 
 def test_discs_that_miss_each_other_have_the_point_between() -> None:
     """By more than rounding none should."""
-    discs = Discs(1.0 + 1j, 1.0, 4.0 + 1j, 1.0)
-    assert discs.best(9.0 + 1j) == discs.best(1.0 + 0j, far=True) == 2.0 + 1j
+    for axis in (1.0 + 0j, 1j):
+        discs = Discs(1.0 + 1j, 1.0, 1.0 + 1j + 3.0 * axis, 1.0)
+        assert discs.best(1.0 + 1j + 9.0 * axis) == discs.best(axis, far=True) == 1.0 + 1j + axis
 
 
 def test_bounds_that_conflict_by_rounding_are_all_met() -> None:

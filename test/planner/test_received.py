@@ -88,6 +88,13 @@ def test_uncertain_received_state_keeps_it_farther_away() -> None:
     assert [r.reason for r in refused.rejected] == ['received estimate too uncertain']
 
 
+def test_one_in_sight_comes_before_a_nearer_received_one() -> None:
+    ahead, behind = seen(0.0, (1.1, 0.0, 2.0), (-0.2, 0.0, 0.0)), (-1.0, 0.0, 2.0)
+    for received in (True, False):
+        decision = decide(Memory(), 0.0, ahead, seen(0.0, behind, name='B', received=received))[1]
+        assert (commanded(decision)[0] < -0.3) == received  # else the nearer one is first
+
+
 FLOCK = PlannerParams(resume_timeout=12.0, vehicles={
     'leader': Member(), 'behind': Member('follower'), 'ahead': Member('follower')})
 PLACES = {'leader': (2.0, 0.0, 2.0), 'behind': (-1.9, 0.0, 2.0), 'ahead': (2.0, 0.0, 2.0)}
