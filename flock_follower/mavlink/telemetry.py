@@ -54,9 +54,9 @@ HEARTBEAT_PERIOD: Final[float] = 1.0
 ESTIMATE_TIMEOUT: Final[float] = 1.0
 #: EXTENDED_SYS_STATE comes at 5 Hz; a landed state older than this, s, is not used.
 LANDED_OLDEST: Final[float] = 3.0
-#: A barometer whose number stays the same for this long on the ground, s, has no noise: a
-#: simulated one, which stays the same in a hover, too.
-NOISELESS_TIME: Final[float] = 0.5
+#: A barometer whose number changes on the ground so often in a row has noise (3 s at 20 Hz). One
+#: without noise, a simulated one, repeats its number in a hover, too.
+NOISY_CHANGES: Final[int] = 60
 #: An altitude above sea level older than this, s, is not used.
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: The autopilot has rebooted if stamps of two consecutive attitudes go back by more than this, ms.
@@ -127,8 +127,7 @@ class Telemetry:
         """The newest message of each type, and its time of arrival, s."""
         self.sensor_altitude: SensorAltitude | None = None
         self._pressure_altitude = math.nan  # m
-        self._pressure_changed = -math.inf  # s
-        self._noiseless = False
+        self._changes = 0  # of the pressure on the ground, in a row
         self.reboots = 0
         self.heartbeat_time = -math.inf
         self.mode_time = -math.inf
@@ -284,13 +283,12 @@ class Telemetry:
         return None if home is None or above_sea is None else above_sea - home.altitude * 1e-3
 
     def _take_pressure(self, altitude: float, now: float) -> None:
-        if altitude != self._pressure_altitude:
-            self._pressure_altitude, self._pressure_changed = altitude, now
-        elif self.is_flying(now):
-            if not self._noiseless:  # the same number again is no measurement: it is stuck
+        repeats, self._pressure_altitude = altitude == self._pressure_altitude, altitude
+        if self.is_flying(now):
+            if repeats and self._changes >= NOISY_CHANGES:  # it is stuck: this is no measurement
                 return
-        elif now - self._pressure_changed > NOISELESS_TIME:
-            self._noiseless = True
+        elif self.landed == mavlink.MAV_LANDED_STATE_ON_GROUND and self._changes < NOISY_CHANGES:
+            self._changes = 0 if repeats else self._changes + 1
         self.sensor_altitude = SensorAltitude(now, altitude, 'SCALED_PRESSURE')
 
     def _distance(self, message: Any, now: float) -> None:

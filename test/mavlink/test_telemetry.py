@@ -129,16 +129,17 @@ def test_a_rangefinder_without_a_valid_signal_has_no_altitude(quality, altitude)
     assert altitude == (None if known is None else known.altitude)
 
 
-@pytest.mark.parametrize(('noise', 'newest'), [(0.01, 3.0), (0.0, 4.0)])
-def test_a_pressure_that_repeats_in_flight_is_stuck_if_it_has_noise(noise, newest):
+@pytest.mark.parametrize(('noise', 'grounded', 'newest'), [
+    (0.01, 3.5, 4.5), (0.0, 3.5, 5.0), (0.01, 2.0, 5.0), (0.01, 0.0, 5.0)])
+def test_pressure_that_repeats_in_flight_is_stuck_if_it_had_noise(noise, grounded, newest):
     telemetry = Telemetry()
-    for k in range(41):
-        now = 0.1 * k
-        state = (mavlink.MAV_LANDED_STATE_ON_GROUND if now < 2.0 else
+    for k in range(101):
+        now = 0.05 * k
+        state = (mavlink.MAV_LANDED_STATE_ON_GROUND if now < grounded else
                  mavlink.MAV_LANDED_STATE_IN_AIR)
         telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, state), now)
         telemetry.update(mavlink.MAVLink_scaled_pressure_message(
-            0, 950.0 + noise * min(k, 30), 0.0, 2000), now)
+            0, 950.0 + noise * min(k, 90), 0.0, 2000), now)
     assert telemetry.sensor_altitude.time == pytest.approx(newest)
 
 
