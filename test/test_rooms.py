@@ -130,7 +130,7 @@ LIMITS = {'flock_follower.planner', 'flock_follower.planner.limits',
 #: command overrules, and by 55 for a height whose odometry diverges slowly, or whose barometer
 #: fails, too.
 MOST_STATEMENTS = {
-    'relative_pose': 5577, 'planner': 3719, 'mavlink_bridge': 5955, 'flock': 1965}
+    'relative_pose': 5577, 'planner': 3719, 'mavlink_bridge': 5953, 'flock': 1965}
 
 
 class Module(NamedTuple):
