@@ -131,7 +131,7 @@ def test_a_rangefinder_without_a_valid_signal_has_no_altitude(quality, altitude)
 
 @pytest.mark.parametrize(('noise', 'grounded', 'newest'), [
     (0.01, 3.5, 4.5), (0.0, 3.5, 5.0), (0.01, 2.0, 5.0), (0.01, 0.0, 5.0)])
-def test_pressure_that_repeats_in_flight_is_stuck_if_it_had_noise(noise, grounded, newest):
+def test_repeated_pressure_in_flight_is_stuck_if_it_had_noise(noise, grounded, newest):
     telemetry = Telemetry()
     for k in range(101):
         now = 0.05 * k
