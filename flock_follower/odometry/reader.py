@@ -73,7 +73,7 @@ from flock_follower.ranges import Checked, parameter, Range
 #: If the reading of the velocity changes, the step is faded out with this time constant, s.
 FADE_TIME = 0.5
 #: A step that has faded to this, m/s, is over: it is less than rounding.
-FADED = 1e-15
+FADED_STEP = 1e-15
 #: Messages over which latency and rate are reported.
 MAX_REPORTED = 50
 #: Number of attitudes kept, to derive angular rates if the messages have none.
@@ -297,7 +297,7 @@ class OdometrySource:
         if self._fading is not None:
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading
-            if max(map(abs, self._fading.tolist())) < FADED:
+            if max(map(abs, self._fading.tolist())) < FADED_STEP:
                 self._fading = None
         return velocity
 

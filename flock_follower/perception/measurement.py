@@ -158,7 +158,7 @@ MIRRORED_EVERY = 30
 #: Images from one fit of the mirrored attitude of a smeared print to the next.
 SMEARED_EVERY = 3
 #: Probability of the mirrored attitude below which the other one is settled.
-SETTLED = 0.05
+SETTLED_DOUBT = 0.05
 
 
 def images_unchecked(found: Measurement, expected: PosePrior) -> int:
@@ -167,6 +167,7 @@ def images_unchecked(found: Measurement, expected: PosePrior) -> int:
     if found.spacing is not None:
         return MIRRORED_EVERY - 1 if found.margin > SETTLED_MARGIN else 0
     # Both attitudes in one, with a margin of 0, may part soon.
-    settled = found.margin > 0.0 and found.doubt < SETTLED and expected.pose is not None and (
-        angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
+    settled = found.margin > 0.0 and found.doubt < SETTLED_DOUBT and (
+        expected.pose is not None
+        and angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
     return SMEARED_EVERY - 1 if settled else 0

@@ -154,15 +154,9 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     missed = [normal.real * ax + normal.imag * ay < least for normal, least in bounds]
     if not any(missed):
         return limit_command(a, v, a_max, fastest, period)
-    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
-    strongest = a_max * SENT_INSIDE
-    left = math.sqrt(max(fastest ** 2 - (vz + vertical * period) ** 2, 0.0))
-    lost_x, lost_y, _ = np.asarray(drag).tolist()
-    slowly, goal = max(SPEED_TIME, period), complex(*limit_norm(a, SANE)[:2].tolist())
-    within = complex(0.0 - vx / period, 0.0 - vy / period), left / period
-    smooth = complex(lost_x - vx / slowly, lost_y - vy / slowly), left / slowly
-    discs, by_speed = Discs(
-        0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within), Discs(*smooth, *smooth)
+    (discs, by_speed), goal = _limit_discs(
+        (vx, vy, vz), vertical, fastest, a_max, np.asarray(drag).tolist(), period), complex(
+        *limit_norm(a, SANE)[:2].tolist())
     # Cohesion comes last in the order: the other bounds are firm.
     firm = [bound for bound, side in zip(bounds, sides) if side[2] != COHESION]
     point = nearest_in_order(goal, firm, discs)
@@ -180,6 +174,19 @@ def keep_bounds(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
         bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
     binding = sorted({sides[k][2] for k in acting}, key=REASONS.index)
     return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
+
+
+def _limit_discs(velocity: Sequence[float], vertical: float, fastest: float, a_max: float,
+                 drag: Sequence[float], period: float) -> tuple[Discs, Discs]:
+    """Return the limits of the horizontal acceleration: all of them, and by the speed alone."""
+    (vx, vy, vz), (lost_x, lost_y, _) = velocity, drag
+    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
+    left, slowly = math.sqrt(max(fastest ** 2 - (vz + vertical * period) ** 2, 0.0)), max(
+        SPEED_TIME, period)
+    within = complex(0.0 - vx / period, 0.0 - vy / period), left / period
+    smooth = complex(lost_x - vx / slowly, lost_y - vy / slowly), left / slowly
+    return Discs(0j, math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0)),
+                 *within), Discs(*smooth, *smooth)
 
 
 def _reduce_cohesion(normal: complex, least: float, goal: complex, start: complex,
